@@ -15,19 +15,20 @@ class DensityHead(nn.Module, ABC):
     The framework puts one linear layer, encoder features → `size` raw parameters, in front of every head (the final
     layer "set to match the number of required parameters", thesis §3.6.1). So a head defines the meaning of the raw
     parameters and nothing before them, and any head can be a component of another: a mixture of K components reads K ×
-    (component.size + 1) raw parameters. A head that is `direct` reads the features themselves.
+    (component.size + 1) raw parameters. A head that is `direct` reads the features themselves, as a vector or in the
+    shape that it says (`raw_shape`).
 
     A constructor takes `target: Target` (framework.target) before `*`; its keyword-only parameters are the config. It
     calls `target.require("angle", by="...")` or the like to refuse targets that it cannot describe.
 
     The density is a `torch.distributions.Distribution` (build it with `validate_args=False`, since the head checks
-    `raw`) with `batch_shape == raw.shape[:-1]`. Its `event_shape` is `target.event_shape`: `(len(target.names),)` for
-    angles and reals, `()` for classes, `(height, width, len(target.names))` for images. It has `log_prob` (nats),
-    `sample`, `entropy` (nats) and `mode`. Angles are radians and read modulo 2π; the `support` of their density is
-    `distributions.circular.circular`. framework.distributions.protocol describes all other functions of a density. A
-    density over several numbers registers `marginal`. A density over an image registers `images`. A density whose
-    log_prob draws nothing registers `exact_estimate` as its `estimate`. The other functions have defaults, none of
-    which claims to be exact.
+    `raw`). Its `batch_shape` is the shape of `raw` without the last dimensions, which are `raw_shape`. Its
+    `event_shape` is `target.event_shape`: `(len(target.names),)` for angles and reals, `()` for classes, `(height,
+    width, len(target.names))` for images. It has `log_prob` (nats), `sample`, `entropy` (nats) and `mode`. Angles are
+    radians and read modulo 2π; the `support` of their density is `distributions.circular.circular`.
+    framework.distributions.protocol describes all other functions of a density. A density over several numbers
+    registers `marginal`. A density over an image registers `images`. A density whose log_prob draws nothing registers
+    `exact_estimate` as its `estimate`. The other functions have defaults, none of which claims to be exact.
 
     Raw parameters may be any finite numbers, however large. The head maps them to a density whose log_prob is finite
     wherever the true one is, in float32 and float64; half precision is upcast to float32. Non-finite raw parameters are
@@ -44,7 +45,7 @@ class DensityHead(nn.Module, ABC):
     attributes has {}.
     """
     direct: ClassVar[bool] = False
-    """True if the last encoder's flattened features are the raw parameters, without a linear layer.
+    """True if the last encoder's features are the raw parameters, without a linear layer.
 
     An example is a head behind an encoder that returns an image. The encoder must then return `size` features.
     """
@@ -56,6 +57,16 @@ class DensityHead(nn.Module, ABC):
     The model has one network for each entry, and the entries add up to `size`. With (), one network gives all raw
     parameters. The constructor may set the attribute.
     """
+
+    @property
+    def raw_shape(self) -> tuple[int, ...]:
+        """Shape of the raw parameters of one sample; `(size,)` by default.
+
+        A direct head that reads an image overrides it, such as (channel, height, width). Its methods then read raw
+        parameters of shape (*batch, channel, height, width), and the model reshapes features only if they have another
+        shape. Heads that are not direct, and components of other heads, read vectors.
+        """
+        return (self.size,)
 
     @abstractmethod
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:

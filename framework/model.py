@@ -51,8 +51,8 @@ class Predictor(nn.Module, ABC):
 class Model(Predictor):
     """A chain of encoders, a linear layer to the raw parameters, and a density head.
 
-    A head that is fitted at once (`Fitted`) or `direct` reads the flattened features themselves, without the linear
-    layer.
+    A head that is fitted at once (`Fitted`) reads the flattened features themselves, without the linear layer. A
+    `direct` head reads them in the shape that it says (`raw_shape`).
 
     Args:
         encoders: the encoders, in the order in which they are applied.
@@ -97,7 +97,7 @@ class Model(Predictor):
                     f"{head.size:,} numbers without a linear layer in between. Choose an encoder that gives as many, "
                     "or change the channels of the encoder."
                 )
-            self.projection = nn.Flatten()
+            self.projection = _reshaping(tuple(shape), head.raw_shape)
         elif beside:
             self.projection = nn.Flatten()
         elif len(shape) == 1:
@@ -124,8 +124,8 @@ class Model(Predictor):
         """Return the density for a batch of inputs; objectives may shape it by gradient."""
         return self(inputs)
 
-    def raw(self, inputs: Tensor) -> Float[Tensor, "batch size"]:
-        """Return the raw parameters that the head reads, (batch, size)."""
+    def raw(self, inputs: Tensor) -> Float[Tensor, "batch *raw"]:
+        """Return the raw parameters that the head reads, (batch, *raw_shape)."""
         return (
             self._raw(inputs)
             if self.shared_result is None
@@ -142,6 +142,14 @@ class Model(Predictor):
         pairs = [(self.raw(batch["input"]), batch["target"]) for batch in batches]
         raws, targets = zip(*pairs, strict=True)
         self.head.calibrate(torch.cat(raws), torch.cat(targets))
+
+
+def _reshaping(shape: tuple[int, ...], raw_shape: tuple[int, ...]) -> nn.Module:
+    """Return the layer between features of `shape` and a direct head that reads raw parameters of `raw_shape`."""
+    if shape == raw_shape:
+        return nn.Identity()
+    flatten = nn.Flatten()
+    return flatten if len(raw_shape) == 1 else nn.Sequential(flatten, nn.Unflatten(1, raw_shape))
 
 
 @final

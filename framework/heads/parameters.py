@@ -9,18 +9,22 @@ from framework.density_head import DensityHead
 from framework.errors import ConfigError, NonFiniteParameters
 
 
-def require_finite(raw: Tensor, size: int) -> Tensor:
-    """Return `raw` (*batch, size) if it is finite, half precision upcast to float32.
+def require_finite(raw: Tensor, shape: int | tuple[int, ...]) -> Tensor:
+    """Return `raw` (*batch, *shape) if it is finite, half precision upcast to float32.
+
+    Args:
+        raw: raw parameters.
+        shape: `raw_shape` of the head; a number means a vector of this size.
 
     Raises:
-        ValueError: the last dimension is not `size`.
+        ValueError: the last dimensions are not `shape`.
         NonFiniteParameters: a number is not finite; it is also a ValueError, and its message names the first such batch
             row.
     """
-    if raw.shape[-1] != size:
-        raise ValueError(
-            f"Got raw parameters of shape {tuple(raw.shape)}; expected {size} in the last dimension."
-        )
+    own = (shape,) if isinstance(shape, int) else shape
+    if raw.shape[-len(own) :] != own:
+        last = f"{own[0]} in the last dimension" if len(own) == 1 else f"{own} in the last dimensions"
+        raise ValueError(f"Got raw parameters of shape {tuple(raw.shape)}; expected {last}.")
     # If the sum is finite, so is every number. This takes one pass; heads of very many numbers notice a second one.
     # An exported program checks its inputs instead, because a trace cannot depend on values.
     if (
@@ -28,7 +32,7 @@ def require_finite(raw: Tensor, size: int) -> Tensor:
         and not math.isfinite(float(raw.detach().sum()))
         and not raw.isfinite().all()
     ):
-        row = tuple((~raw.isfinite().all(-1)).nonzero()[0].tolist())
+        row = tuple((~raw.isfinite().flatten(-len(own)).all(-1)).nonzero()[0].tolist())
         raise NonFiniteParameters(
             f"The raw parameters are not finite in batch row {row[0] if len(row) == 1 else row}."
         )
@@ -56,8 +60,13 @@ def require_trained(component: DensityHead) -> DensityHead:
 
     Raises:
         ConfigError: the component fits something after training, for which it would have to know which data belong to
-            it; or it requires backbones, which only the head of a model has.
+            it; or it requires backbones, which only the head of a model has; or it reads an image.
     """
+    if len(component.raw_shape) != 1:
+        raise ConfigError(
+            f"density_head.component reads raw parameters of shape {component.raw_shape}, but a component must read a "
+            "vector. Choose another component."
+        )
     if component.backbones:
         raise ConfigError(
             "density_head.component requires separate networks for its parts, but only the head of a model has "

@@ -76,9 +76,7 @@ def examine_densities(subject: HeadSubject) -> Iterator[Finding]:
         scales = {"own": [own] * 3, "many": [s for s in (1e-2, 1.0, 1e2) for _ in range(64)]}.get(
             batch, [s for s in (*SCALES, own) for _ in range(repeats)]
         )
-        raw = subject.raw_parameters(len(scales)).double() * torch.tensor(
-            scales, dtype=torch.float64
-        ).unsqueeze(-1)
+        raw = subject.scaled_parameters(scales)
         head = subject.make().double()
         head.requires_grad_(False)
         names = [f"raw parameters of size {scale:g}, batch row {row}" for row, scale in enumerate(scales)]

@@ -160,7 +160,8 @@ def mean_gradient_is_zero(subject: HeadSubject, worst: Worst) -> None:
         return
     head, draws = subject.make().double(), 1000 if len(subject.row.target.names) > 2 else 4000
     for size in (0.3, 3.0, 30.0):
-        raw = (size * subject.raw_parameters(3).double()).expand(draws, -1, -1).clone().requires_grad_()
+        raw = size * subject.raw_parameters(3).double()
+        raw = raw.expand(draws, *raw.shape).clone().requires_grad_()
         with torch.no_grad():
             value = head.eval()(raw[0]).sample(torch.Size((draws,)))
         # gradients at random targets show how large the gradient at values that were not drawn may be
@@ -169,6 +170,7 @@ def mean_gradient_is_zero(subject: HeadSubject, worst: Worst) -> None:
         if gradient is None:
             worst.record(math.inf, "the loss does not depend on the raw parameters")
             return
+        gradient = gradient.flatten(2)
         rare = 2 * gradient.abs().amax((0, 2)).unsqueeze(-1) / draws
         gradient = gradient[32:]
         noise = gradient.std(0) / draws**0.5 + rare + 1e-12

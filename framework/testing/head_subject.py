@@ -1,6 +1,6 @@
 """A density head under test, with seeded raw parameters and targets for it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -52,15 +52,20 @@ class HeadSubject:
         return self.build().eval()
 
     @cached_property
-    def size(self) -> int:
-        """Number of raw parameters that the head reads for a sample."""
+    def raw_shape(self) -> tuple[int, ...]:
+        """Shape of the raw parameters that the head reads for a sample."""
         with torch.random.fork_rng(devices=[]):
-            return self.make().size
+            return self.make().raw_shape
 
     def raw_parameters(self, *batch: int) -> Tensor:
-        """Return seeded raw parameters with a standard normal distribution, (*batch, size), float32."""
+        """Return seeded raw parameters with a standard normal distribution, (*batch, *raw_shape), float32."""
         generator = torch.Generator().manual_seed(SEED)
-        return torch.randn(*batch, self.size, generator=generator)
+        return torch.randn(*batch, *self.raw_shape, generator=generator)
+
+    def scaled_parameters(self, sizes: Sequence[float]) -> Tensor:
+        """Return raw parameters for one sample of each size, (sample, *raw_shape), float64."""
+        factors = torch.tensor(sizes, dtype=torch.float64)
+        return self.raw_parameters(len(sizes)).double() * factors.view(-1, *[1] * len(self.raw_shape))
 
     def values(self, *batch: int) -> Tensor:
         """Return seeded targets (*batch, *event), as the function `values` does."""

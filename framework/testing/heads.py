@@ -68,6 +68,7 @@ def examine_head(subject: HeadSubject) -> Iterator[Finding]:
 
 def _on_one_device(subject: HeadSubject, worst: Worst) -> None:
     """Check that losses, calibration and all functions of the densities mix no devices."""
+
     def calls(mode: OneDevice) -> Calls:
         head = subject.make()
         mode.label_module(head)
@@ -164,7 +165,7 @@ def _refuses_non_finite(subject: HeadSubject, worst: Worst) -> None:
     for bad in (math.nan, math.inf, -math.inf):
         for column in range(0, head.size, max(1, head.size // 7)):
             raw = subject.raw_parameters(5)
-            raw[3, column] = bad
+            raw[3].view(-1)[column] = bad
             raw[4] = bad
             try:
                 head(raw)
@@ -390,11 +391,11 @@ def _calibrate_backwards(subject: HeadSubject, worst: Worst) -> None:
 
 def _reads_all_parameters(subject: HeadSubject, worst: Worst) -> None:
     """Check that each raw parameter has an effect: its change must change the loss of some target."""
-    head, columns = subject.make().double().train(), range(subject.size)
+    head = subject.make().double().train()
     if head.direct or isinstance(head, Fitted):
         worst.count(False, "the head reads features rather than raw parameters")
         return
-    unread = set(columns)
+    unread = set(range(head.size))
     for size in (0.3, 1.0, 3.0):
         raw, value = (size * subject.raw_parameters(8)).double(), as_type(subject.values(8), torch.float64)
         with torch.no_grad():
@@ -406,7 +407,7 @@ def _reads_all_parameters(subject: HeadSubject, worst: Worst) -> None:
                 seed(SEED)
                 if not torch.equal(head.loss(other, value), before):
                     unread.remove(column)
-            if len(unread) > max(0, subject.size - MOST_COLUMNS):
+            if len(unread) > max(0, head.size - MOST_COLUMNS):
                 continue
             unread = set()
             break

@@ -61,9 +61,7 @@ def _compare_units(
     seed(SEED)
     alone = subject.build_for(replace(target, location=(), scale=())).eval().double()
     unit = f"location {location[0].item():g}, scale {scale[0].item():g}"
-    raw = subject.raw_parameters(12).double() * torch.tensor([0.3, 1.0, 3.0], dtype=torch.float64).repeat(
-        4
-    ).unsqueeze(-1)
+    raw = subject.scaled_parameters([0.3, 1.0, 3.0] * 4)
     standard = subject.values(12).double()
     with torch.no_grad():
         # some values near the mode, where a narrow density is not negligible

@@ -120,6 +120,7 @@ def batches(row: WrapperRow) -> list[Batch]:
 
 def _on_one_device(make: Make, row: WrapperRow, worst: Worst) -> None:
     """Check that losses, calibration and all functions of the calibrated densities mix no devices."""
+
     def calls(mode: OneDevice) -> Calls:
         wrapper = make()
         mode.label_module(wrapper)

@@ -42,23 +42,30 @@ class BernoulliImageHead(DensityHead):
     def __init__(self, target: Target) -> None:
         super().__init__()
         target.require("image", by="density_head bernoulli_image")
-        self.shape = (len(target.names), *target.size)
-        self.size = math.prod(self.shape)
+        self.target = target
+        self.size = math.prod(self.raw_shape)
         self.register_buffer("factor", torch.ones((), dtype=torch.float64))
         require_state(self, factor=(LEAST / 2, 2 * MOST))
 
-    def forward(self, raw: Float[Tensor, "*batch size"]) -> BernoulliImage:
+    @property
+    def raw_shape(self) -> tuple[int, ...]:
+        """Shape of the features that the head reads: (channel, height, width)."""
+        return (len(self.target.names), *self.target.size)
+
+    def forward(self, raw: Float[Tensor, "*batch channel height width"]) -> BernoulliImage:
         """Return the density for raw parameters."""
         logits = self._logits(raw)
         return BernoulliImage(logits * self.factor.to(logits))
 
-    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+    def loss(
+        self, raw: Float[Tensor, "*batch channel height width"], target: Tensor
+    ) -> Float[Tensor, "*batch"]:
         """Return the mean cross-entropy of the numbers of each image, nats per number."""
         # without the calibrated factor, so that the loss does not change with calibration
         return -BernoulliImage(self._logits(raw)).each_log_prob(target).mean((-3, -2, -1))
 
     @torch.no_grad()
-    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+    def calibrate(self, raw: Float[Tensor, "batch channel height width"], target: Tensor) -> None:
         """Fit the factor by which all log-odds are multiplied, by maximum likelihood."""
         # the log-likelihood is concave in the factor, so that its derivative has a single zero
         require_validation(raw, "The factor of the log-odds is")
@@ -80,7 +87,10 @@ class BernoulliImageHead(DensityHead):
             total += float((logits * (value.double().clamp(0, 1) - (factor * logits).sigmoid())).sum())
         return total
 
-    def _logits(self, raw: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch height width number"]:
-        image = require_finite(raw, self.size).unflatten(-1, self.shape).movedim(-3, -1)
+    def _logits(
+        self, raw: Float[Tensor, "*batch channel height width"]
+    ) -> Float[Tensor, "*batch height width number"]:
+        # a network in training gives channels last; sums over an image then have another order and other last bits
+        image = require_finite(raw, self.raw_shape).contiguous().movedim(-3, -1)
         # log((1 - w) / w) for the feature w, in float64, because near 1 a float32 has too few digits of 1 - w
         return -hardtanh(image.double(), SMALLEST, 1 - SMALLEST).logit().to(image.dtype)

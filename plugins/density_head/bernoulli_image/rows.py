@@ -20,12 +20,12 @@ def bernoulli_cases(head: DensityHead) -> Iterator[Case]:
     w is the clamped feature of the number.
     """
     for white in WHITE:
-        raw = torch.full((2, head.size), white, dtype=torch.float64)
+        raw = torch.full((2, *head.raw_shape), white, dtype=torch.float64)
         with mpmath.workdps(50):
             bounded_white = min(max(mpmath.mpf(white), mpmath.mpf(1e-3)), mpmath.mpf(1 - 1e-3))
             log_prob = [float(head.size * mpmath.log(part)) for part in (bounded_white, 1 - bounded_white)]
-        shape = (2, 3, 1) if head.size == 6 else (1, 2, 2)
-        value = torch.tensor([0.0, 1.0]).double().reshape(2, 1, 1, 1).expand(2, *shape)
+        channels, *size = head.raw_shape
+        value = torch.tensor([0.0, 1.0]).double().reshape(2, 1, 1, 1).expand(2, *size, channels)
         yield Case(f"w = {white:g}", raw, value, torch.tensor(log_prob, dtype=torch.float64))
 
 

@@ -76,14 +76,14 @@ def test_a_mask_is_what_is_rather_there_and_the_colour_the_light_of_its_share() 
 
 def test_the_loss_is_the_cross_entropy_a_number_and_calibration_finds_the_likeliest_factor() -> None:
     generator = torch.Generator().manual_seed(0)
-    truth = 2 * torch.randn(64, 20, generator=generator)
-    target = truth.sigmoid().bernoulli(generator=generator).unflatten(1, (4, 5, 1))
+    truth = 2 * torch.randn(64, 1, 4, 5, generator=generator)
+    target = truth.sigmoid().bernoulli(generator=generator).movedim(1, -1)
     raw = (-3 * truth).sigmoid()  # white where the truth is 0; log-odds three times too large
     head = BernoulliImageHead(TARGET)
     cut = raw.clamp(SMALLEST, 1 - SMALLEST).double()
     wanted = torch.nn.functional.binary_cross_entropy(
-        1 - cut, target.flatten(1).double(), reduction="none"
-    ).mean(1)
+        1 - cut, target.movedim(-1, 1).double(), reduction="none"
+    ).mean((1, 2, 3))
     torch.testing.assert_close(head.loss(raw, target), wanted.float())
     losses = {}
     head.calibrate(raw, target)

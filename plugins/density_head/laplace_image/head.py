@@ -73,8 +73,8 @@ class LaplaceImageHead(DensityHead):
         target.require("image", by="density_head laplace_image")
         self.numbers = len(target.names)
         self.scales = {"fixed": 0, "pixel": 1, "number": self.numbers}[scale]
-        self.shape = (self.numbers + self.scales, *target.size)
-        self.size = math.prod(self.shape)
+        self.image_size = target.size
+        self.size = math.prod(self.raw_shape)
         self.cover = cover
         self.balance = balance
         self.floor = floor
@@ -82,12 +82,19 @@ class LaplaceImageHead(DensityHead):
         self.register_buffer("factor", torch.ones((), dtype=torch.float64))
         require_state(self, factor=(SMALLEST_SCALE, LARGEST_SCALE))
 
-    def forward(self, raw: Float[Tensor, "*batch size"]) -> LaplaceImage:
+    @property
+    def raw_shape(self) -> tuple[int, ...]:
+        """Shape of the features that the head reads: (channel, height, width)."""
+        return (self.numbers + self.scales, *self.image_size)
+
+    def forward(self, raw: Float[Tensor, "*batch channel height width"]) -> LaplaceImage:
         """Return the density for raw parameters."""
         location, scale = self._parts(raw)
         return LaplaceImage(location, (scale * self.factor.to(scale)).clamp(SMALLEST_SCALE, LARGEST_SCALE))
 
-    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+    def loss(
+        self, raw: Float[Tensor, "*batch channel height width"], target: Tensor
+    ) -> Float[Tensor, "*batch"]:
         """Return the weighted mean negative log-density of the numbers of each image, nats per number."""
         # without the calibrated factor, so that the loss does not change with calibration
         density = LaplaceImage(*self._parts(raw))
@@ -101,7 +108,7 @@ class LaplaceImageHead(DensityHead):
         return losses.mean((-3, -2, -1))
 
     @torch.no_grad()
-    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+    def calibrate(self, raw: Float[Tensor, "batch channel height width"], target: Tensor) -> None:
         """Fit the factor by which all scales are multiplied to the validation split."""
         require_validation(raw, "The scale of an image's numbers is")
         parts = zip(target, map(self._parts, raw), strict=True)
@@ -122,12 +129,13 @@ class LaplaceImageHead(DensityHead):
             factor = inside.kthvalue(rank).values.double() / -math.log1p(-self.cover)
         self.factor.copy_(torch.as_tensor(factor).clamp(SMALLEST_SCALE, LARGEST_SCALE))
 
-    def _parts(self, raw: Float[Tensor, "*batch size"]) -> tuple[Tensor, Tensor]:
+    def _parts(self, raw: Float[Tensor, "*batch channel height width"]) -> tuple[Tensor, Tensor]:
         """Return the locations, (*batch, height, width, number), and the scales before calibration.
 
         The scales broadcast to the locations.
         """
-        image = require_finite(raw, self.size).unflatten(-1, self.shape).movedim(-3, -1)
+        # a network in training gives channels last; sums over an image then have another order and other last bits
+        image = require_finite(raw, self.raw_shape).contiguous().movedim(-3, -1)
         location = hardtanh(image[..., : self.numbers], -FURTHEST, FURTHEST)
         if not self.scales:
             return location, location.new_ones(())

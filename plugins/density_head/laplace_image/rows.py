@@ -20,20 +20,19 @@ def laplace_cases(head: DensityHead) -> Iterator[Case]:
     d is the distance of the target from the location. b is exp(r), clamped, for a predicted log-scale r, and 1 if no
     scale is predicted.
     """
-    numbers = 3 if head.size % 9 == 0 or head.size % 6 == 0 else 1
-    pixels = 6 if numbers == 3 else 1
-    predicted = head.size - numbers * pixels
-    for log_scale in (-100.0, -3.0, 0.0, 2.0, 40.0) if predicted else (0.0,):
+    channels, *size = head.raw_shape
+    numbers, pixels = (3, 6) if size == [2, 3] else (1, 1)
+    for log_scale in (-100.0, -3.0, 0.0, 2.0, 40.0) if channels > numbers else (0.0,):
         with mpmath.workdps(50):
             scale = min(max(mpmath.e**log_scale, mpmath.mpf("1e-4")), mpmath.mpf("1e6"))
             log_prob = [
                 float(numbers * pixels * (-abs(mpmath.mpf(offset)) / scale - mpmath.log(2 * scale)))
                 for offset in torch.tensor(OFFSETS).double().tolist()
             ]
-        raw = torch.zeros(len(OFFSETS), head.size, dtype=torch.float64)
-        raw[:, numbers * pixels :] = log_scale
+        raw = torch.zeros(len(OFFSETS), *head.raw_shape, dtype=torch.float64)
+        raw[:, numbers:] = log_scale
         value = torch.tensor(OFFSETS).double().reshape(-1, 1, 1, 1)
-        value = value.expand(-1, *((2, 3) if pixels == 6 else (1, 1)), numbers)
+        value = value.expand(-1, *size, numbers)
         yield Case(f"r = {log_scale:g}", raw, value, torch.tensor(log_prob, dtype=torch.float64))
 
 

@@ -66,11 +66,10 @@ def test_the_picture_is_the_light_of_its_numbers_and_that_of_members_their_mean(
 @pytest.mark.parametrize("white", [1.0, 1 - 2**-24])
 def test_the_loss_is_the_distance_a_number_and_the_foreground_counts_more(white: float) -> None:
     """Check the loss, also where white has lost a bit in the conversion to linear RGB: 0.99999994."""
-    raw = torch.rand(2, 60)
+    raw = torch.rand(2, 3, 4, 5)
     target = torch.full((2, 4, 5, 3), white)
     target[:, :2] = 0.25
-    image = raw.reshape(2, 3, 4, 5).movedim(1, -1)
-    distance = (image - target).abs()
+    distance = (raw.movedim(1, -1) - target).abs()
     head = LaplaceImageHead(TARGET)
     torch.testing.assert_close(head.loss(raw, target), distance.mean((1, 2, 3)) + torch.tensor(2.0).log())
     weighted = LaplaceImageHead(TARGET, foreground=5.0).loss(raw, target)
@@ -81,7 +80,7 @@ def test_the_loss_is_the_distance_a_number_and_the_foreground_counts_more(white:
 @pytest.mark.parametrize("scale", ["fixed", "pixel", "number"])
 def test_calibration_takes_the_most_likely_factor_and_leaves_the_loss(scale: str) -> None:
     head = LaplaceImageHead(TARGET, scale=scale)  # type: ignore[arg-type]
-    raw = torch.randn(6, head.size)
+    raw = torch.randn(6, *head.raw_shape)
     target = torch.rand(6, 4, 5, 3)
     before = head.loss(raw, target)
     head.calibrate(raw, target)
@@ -100,10 +99,10 @@ def test_balanced_locations_are_learned_as_by_the_distance_and_scales_as_by_like
     target = torch.rand(2, 4, 5, 3).double()
     gradients = []
     for balance in (0.0, 1.0):
-        raw = torch.randn(2, 80, generator=torch.Generator().manual_seed(1)).double().requires_grad_()
+        raw = torch.randn(2, 4, 4, 5, generator=torch.Generator().manual_seed(1)).double().requires_grad_()
         loss = LaplaceImageHead(TARGET, scale="pixel", balance=balance).loss(raw, target)
         loss.sum().backward()
-        gradients.append((loss.detach(), raw.grad.reshape(2, 4, 4, 5), raw.detach().reshape(2, 4, 4, 5)))
+        gradients.append((loss.detach(), raw.grad, raw.detach()))
     (plain, by_likelihood, raw), (loss, balanced, _) = gradients
     torch.testing.assert_close(loss, plain)
     torch.testing.assert_close(balanced[:, :3], (raw[:, :3] - target.movedim(-1, 1)).sign() / 60)
@@ -120,14 +119,14 @@ def test_intervals_are_fitted_to_what_is_not_background(mass: float) -> None:
     raw[:, :3, 0] += torch.randn(6, 3, 5) * 3
 
     def covered(head: LaplaceImageHead) -> float:
-        head.calibrate(raw.flatten(1), target)
-        quantiles = marginal_cdfs(head(raw.flatten(1)), target)[:, 0]
+        head.calibrate(raw, target)
+        quantiles = marginal_cdfs(head(raw), target)[:, 0]
         return ((2 * quantiles - 1).abs() <= mass + 1e-6).double().mean().item()
 
     assert covered(LaplaceImageHead(TARGET, scale="pixel", cover=mass)) == pytest.approx(mass, abs=0.02)
     assert covered(LaplaceImageHead(TARGET, scale="pixel")) < mass - 0.15
     with pytest.raises(ValueError, match="pixels that are not white"):
-        LaplaceImageHead(TARGET, cover=mass).calibrate(torch.zeros(2, 60), torch.ones(2, 4, 5, 3))
+        LaplaceImageHead(TARGET, cover=mass).calibrate(torch.zeros(2, 3, 4, 5), torch.ones(2, 4, 5, 3))
 
 
 def test_other_targets_are_refused() -> None:

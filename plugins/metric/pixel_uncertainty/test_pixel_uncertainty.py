@@ -25,7 +25,7 @@ LEVEL = torch.arange(1, LEVELS + 1).double() / (LEVELS + 1)
 def laplaces(place: Tensor, wide: Tensor) -> Distribution:
     """Return densities of the density head `laplace_image`."""
     head = build("density_head", resolve("density_head", "laplace_image"), target=TARGET).double()
-    return type(head(torch.zeros(1, head.size).double()))(place, wide)
+    return type(head(torch.zeros(1, *head.raw_shape).double()))(place, wide)
 
 
 def images(count: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -110,7 +110,7 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
         """
         return self.shared_result.get_or_compute(inputs, lambda batch: batch.chunk(self.model_count))
 
-    def _own_raw(self, inputs: Tensor) -> Float[Tensor, "member batch size"]:
+    def _own_raw(self, inputs: Tensor) -> Float[Tensor, "member batch *raw"]:
         assert self.together is not None
         return self.together.own(inputs.unflatten(0, (self.model_count, -1)))
 
@@ -175,10 +175,10 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
                 f"Member {index} of {self.model_count} of the ensemble: {error} {REMEDY}"
             ) from error
 
-    def _densities(self, raw: Float[Tensor, "batch member size"]) -> Distribution:
+    def _densities(self, raw: Float[Tensor, "batch member *raw"]) -> Distribution:
         """Return the densities of the members with the raw parameters `raw`, batch_shape (batch, member)."""
         # the trace of an exported model depends on no value
-        bad = raw if torch.compiler.is_exporting() else (~raw.isfinite()).any(-1).nonzero()
+        bad = raw if torch.compiler.is_exporting() else (~raw.isfinite()).flatten(2).any(-1).nonzero()
         if bad is not raw and len(bad):
             row, index = bad[0].tolist()
             other_members = len(bad[:, 1].unique()) - 1

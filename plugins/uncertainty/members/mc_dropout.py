@@ -97,7 +97,7 @@ class MCDropout(Uncertainty):
             return Reshaped(self.model(inputs.repeat_interleave(self.samples, 0)), whole)
         return Stacked([self.model(inputs) for _ in range(self.samples)])
 
-    def _raws(self, model: Model, inputs: Tensor) -> Float[Tensor, "batch sample size"]:
+    def _raws(self, model: Model, inputs: Tensor) -> Float[Tensor, "batch sample *raw"]:
         """Return the head's raw parameters for every input under each of its S dropout masks."""
         self.layout = self.layout or layout_of(model, inputs)
         at_once = max(1, AT_ONCE // (len(inputs) * self.layout.widest))
@@ -106,13 +106,13 @@ class MCDropout(Uncertainty):
         return torch.cat([compute(model, inputs, count) for count in counts], 1)
 
 
-def require_finite(raw: Float[Tensor, "batch sample size"]) -> Float[Tensor, "batch sample size"]:
+def require_finite(raw: Float[Tensor, "batch sample *raw"]) -> Float[Tensor, "batch sample *raw"]:
     """Return `raw` unchanged.
 
     Raises:
         UserError: a number is not finite; the message names the mask and the input.
     """
-    bad = (~raw.isfinite().all(-1)).nonzero()
+    bad = (~raw.isfinite()).flatten(2).any(-1).nonzero()
     if len(bad):
         row, sample = bad[0].tolist()
         raise UserError(
@@ -127,7 +127,7 @@ def _dropouts(model: nn.Module) -> Iterator[Any]:
     return (module for module in model.modules() if isinstance(module, DROPOUT))
 
 
-def _vectorised(model: Model, inputs: Tensor, count: int) -> Float[Tensor, "batch sample size"]:
+def _vectorised(model: Model, inputs: Tensor, count: int) -> Float[Tensor, "batch sample *raw"]:
     """Return the raw parameters of `count` passes with different dropout masks, by `torch.vmap`.
 
     Layers before the first dropout layer are computed only once.
@@ -136,7 +136,7 @@ def _vectorised(model: Model, inputs: Tensor, count: int) -> Float[Tensor, "batc
     return sampled(torch.empty(count, device=inputs.device))
 
 
-def _repeated(model: Model, inputs: Tensor, count: int) -> Float[Tensor, "batch sample size"]:
+def _repeated(model: Model, inputs: Tensor, count: int) -> Float[Tensor, "batch sample *raw"]:
     """Return the raw parameters under `count` dropout masks, by one pass over `count` copies of every input."""
     return model.raw(inputs.repeat_interleave(count, 0)).unflatten(0, (len(inputs), count))
 
