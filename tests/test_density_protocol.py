@@ -74,7 +74,7 @@ class Made:
         config = resolve("density_head", {"name": name, **row.config})
         head = fit_if_needed(build("density_head", config, target=row.target).double(), row.target).eval()
         torch.manual_seed(1)
-        raws = spread * torch.randn(3, BATCH, head.size, dtype=torch.float64)
+        raws = spread * torch.randn(3, BATCH, *head.raw_shape, dtype=torch.float64)
         torch.manual_seed(100 + seed)
         self.parts = [head(raw) for raw in raws]
         self.target = row.target
