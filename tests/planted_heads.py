@@ -209,6 +209,11 @@ class Faulty(DensityHead):
         if "knobs" in parts:
             self.knobs = parts["knobs"]()  # pyright: ignore[reportAttributeAccessIssue]
 
+    @property
+    def raw_shape(self) -> tuple[int, ...]:
+        """Shape of the raw parameters of the correct head."""
+        return self.sound.raw_shape
+
     def forward(self, raw: Tensor) -> Distribution:
         found = self.parts["forward"](self, raw) if "forward" in self.parts else self.sound(raw)
         return Changed(found, self.parts)
