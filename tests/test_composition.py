@@ -28,8 +28,8 @@ from framework.configuration.settings import (
     PRECISIONS,
     STRATEGIES,
     TRAINER_OURS,
+    Settings,
     TrainerSettings,
-    settings,
 )
 from framework.errors import ConfigError
 from framework.storage import cache
@@ -54,8 +54,8 @@ def test_every_experiment_composes_and_its_plugins_accept_it(name: str) -> None:
     from framework.configuration.assembly import assemble
 
     values = plain(composed(f"experiment={name}"))
-    settings(values)
-    resolved = assemble(values).parts
+    Settings.of(values)
+    resolved = assemble(Settings.of(values)).parts
     assert resolved["metric"], "an experiment reports something"
     # otherwise the weights of the lowest validation loss, which are kept, are never those of the last epoch
     trainer = values["trainer"]
@@ -118,10 +118,11 @@ def test_an_experiment_of_each_family_can_be_shortened(name: str) -> None:
     from framework.configuration.assembly import assemble
 
     values = plain(composed(f"experiment={name}", "debug=fast"))
-    assemble(values)
+    assemble(Settings.of(values))
     assert values["data"]["name"] in {*SMOKE_RUNS, *NOT_RUN}
     for epochs in (values["trainer"]["max_epochs"], 2):
-        trainer = settings({**values, "trainer": {**values["trainer"], "max_epochs": epochs}}).trainer
+        shortened = {**values, "trainer": {**values["trainer"], "max_epochs": epochs}}
+        trainer = Settings.of(shortened).bounded_trainer
         assert 1 <= trainer["check_val_every_n_epoch"] <= epochs
 
 
@@ -206,7 +207,7 @@ def test_what_an_experiment_sets_of_its_head_can_be_taken_out_for_another(name: 
     while True:
         values = plain(composed(f"experiment={name}", f"density_head={head}", *words))
         try:
-            assemble(values)
+            assemble(Settings.of(values))
         except ConfigError as error:
             unknown = re.search(r"(density_head\.\S+): unknown key", str(error))
             if unknown is None or OmegaConf.select(OmegaConf.create(values), unknown[1]) is None:
@@ -240,12 +241,12 @@ def test_plural_groups_keep_their_order() -> None:
 )
 def test_core_settings_are_checked(overrides: list[str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        settings(plain(composed("data=pascal3d", *overrides)))
+        Settings.of(plain(composed("data=pascal3d", *overrides)))
 
 
 def test_an_unknown_trainer_argument_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"Did you mean 'max_steps'\?"):
-        settings({"trainer": {"max_step": 3}})
+        Settings.of({"trainer": {"max_step": 3}})
 
 
 def test_the_trainer_takes_what_lightning_takes() -> None:

@@ -13,7 +13,7 @@ from PIL import Image
 
 from framework.configuration.registry import installed
 from framework.configuration.schema import build, resolve
-from framework.configuration.settings import settings
+from framework.configuration.settings import Settings
 from framework.datasets import images
 from framework.datasets.images import Crop, cut_square
 from framework.errors import ConfigError, DataError, quote, shorten
@@ -248,7 +248,7 @@ def test_a_pickle_of_tuples_that_hold_the_same_tuple_twice_is_refused() -> None:
 )
 def test_what_the_framework_says_to_the_trainer_is_not_a_configs_to_say(key: str) -> None:
     with pytest.raises(ConfigError, match=rf"trainer\.{key}: unknown key"):
-        settings({"trainer": {key: ["x"]}})
+        Settings.of({"trainer": {key: ["x"]}})
 
 
 NUMBERS_OF_COLUMNS = {name: [0.5, 2.0] for name in ("largest", "mean", "deviation")}

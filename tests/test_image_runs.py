@@ -18,6 +18,7 @@ import framework as package
 from framework.configuration.assembly import assemble, build_data, build_predictor
 from framework.configuration.composition import plain
 from framework.configuration.paths import paths_of
+from framework.configuration.settings import Settings
 from framework.datasets.scan_layout import write_registration
 from framework.deployment.served import _load_pyfunc
 from framework.encoder import Encoder
@@ -266,7 +267,7 @@ def test_the_ground_of_a_photograph_is_white_to_the_bit_and_is_not_computed(
 ) -> None:
     """Losses weigh figures by it, networks leave it out."""
     settings = [*people(tmp_path)[1:], *own]
-    resolved = assemble(plain(composed(f"experiment=smplpix/{way}", *settings))).parts
+    resolved = assemble(Settings.of(plain(composed(f"experiment=smplpix/{way}", *settings)))).parts
     data = build_data(resolved)
     data.prepare()
     batch = default_collate([data.splits().train[index] for index in range(3)])

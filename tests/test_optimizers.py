@@ -13,7 +13,7 @@ from torch.distributions import Independent, Normal
 
 from framework.configuration.assembly import assemble, build_predictor
 from framework.configuration.schema import build, resolve
-from framework.configuration.settings import OptimizerSettings
+from framework.configuration.settings import OptimizerSettings, Settings
 from framework.data import Batch
 from framework.density_head import DensityHead
 from framework.encoder import Encoder
@@ -259,7 +259,7 @@ def test_gradients_are_clipped_in_every_precision(
         "density_head": "bernoulli",
         "uncertainty": {"ensemble": {"name": "ensemble", "members": members}} if members > 1 else {},
     }
-    resolved = assemble(config).parts
+    resolved = assemble(Settings.of(config)).parts
     data = build("data", resolved["data"])
     data.prepare()
     most, rate = 1e-3, 0.5

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from framework.configuration.schema import resolve
-from framework.configuration.settings import settings
+from framework.configuration.settings import Settings
 from framework.datasets.scan_layout import read_cameras
 from framework.errors import UserError
 from framework.runs.job import RECORD, VALUE, read_record
@@ -113,7 +113,7 @@ def setting(folder: Path, value: Any, key: str) -> Any:
     file = written(
         folder / "config.yaml", {key: value} if "." not in key else {"optimizer": {"factor": value}}
     )
-    return settings(read_yaml(file, "a config"))
+    return Settings.of(read_yaml(file, "a config"))
 
 
 def parameter(folder: Path, value: Any, key: str) -> Any:

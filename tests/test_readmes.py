@@ -12,7 +12,6 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
 from framework.configuration import composition
-from framework.configuration.assembly import assemble
 from framework.configuration.command_line import command_line
 from framework.configuration.composition import folder, plain, register
 from framework.configuration.config import Config
@@ -74,7 +73,7 @@ def test_a_command_of_a_readme_composes(
     config = Config.of(plain(composed), tmp_path, arguments)
     assert config.mode in MODES
     if config.mode == "train":
-        assert assemble(config.values).parts["data"]
+        assert config.assembly.parts["data"]
 
 
 def test_there_are_many() -> None:

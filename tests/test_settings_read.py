@@ -37,7 +37,6 @@ from framework.configuration.settings import (
     TrainerSettings,
 )
 from framework.errors import ConfigError
-from framework.runs import session
 from framework.training.schedules import Plateau, make_schedule
 
 GROUPED = {"optimizer": OptimizerSettings, "logger": LoggerSettings, "trainer": TrainerSettings}
@@ -88,20 +87,6 @@ def test_the_key_of_a_group_elsewhere_is_where_it_goes() -> None:
     assert key_of("data@outliers=moons") == "outliers"
     with pytest.raises(ConfigError, match="mode=predict reads no outliers"):
         require_read("predict", ["data@outliers=moons"])
-
-
-class Recorded(dict[str, Any]):
-    """Config that records which of its keys are read by name; copying the whole config reads no key."""
-
-    seen: set[str]
-
-    def __getitem__(self, key: str) -> Any:
-        self.seen.add(key)
-        return super().__getitem__(key)
-
-    def get(self, key: str, default: Any = None) -> Any:
-        self.seen.add(key)
-        return super().get(key, default)
 
 
 MOONS = ("data=moons", "data.train=60", "data.validation=40", "data.test=40")
@@ -158,27 +143,21 @@ def test_a_mode_reads_what_it_says_it_reads(
     config = composed(mode)
     require_read(mode, config.overrides)
     seen: set[str] = set()
-    get, inherited = Settings.__getattribute__, session.inherit_settings
+    get = Settings.__getattribute__
 
     def noting(self: Settings, key: str) -> Any:
         if key in Settings.model_fields:
             seen.add(key)
         return get(self, key)
 
-    def recorded(config: Config) -> Config:
-        values = Recorded(config.values)
-        values.seen = seen
-        return replace(config, values=values)
-
-    monkeypatch.setattr(session, "inherit_settings", lambda *given: recorded(inherited(*given)))
     monkeypatch.setattr(Settings, "__getattribute__", noting)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         if mode == "sync":  # this run has no store
             with pytest.raises(Exception, match="logger=none"):
-                import_module(f"framework.modes.{mode}").run(recorded(config))
+                import_module(f"framework.modes.{mode}").run(config)
         else:
-            import_module(f"framework.modes.{mode}").run(recorded(config))
+            import_module(f"framework.modes.{mode}").run(config)
     said = MODES[mode]
     read = {key.partition(".")[0] for key in said.reads} - {*BUNDLES, *WITH_A_RUN}
     assert seen - {"mode", "stored", *EVERYWHERE, *WITH_A_RUN} == read
@@ -193,7 +172,8 @@ def test_an_option_that_a_mode_has_not_is_refused(mode: str, composed: Callable[
     config = composed(mode)
     others = {key for other in MODES for key in yaml.safe_load((OPTIONS / f"{other}.yaml").read_text())}
     for key in sorted({*others, "nonsense"} - set(known)):
-        wrong = replace(config, values={**config.values, "mode": {**config.values["mode"], key: 1}})
+        mode_options = {**config.settings.mode, key: 1}
+        wrong = replace(config, settings=config.settings.model_copy(update={"mode": mode_options}))
         with pytest.raises(ConfigError, match=rf"mode\.{key}: unknown key"):
             import_module(f"framework.modes.{mode}").run(wrong)
 

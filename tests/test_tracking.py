@@ -1377,11 +1377,18 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, DataFrame]:
     lines = [f"{row},{row % 7},{1e6 * row}" for row in range(40)]
     (folder / "table.csv").write_text("width,height,mass\n" + "\n".join(lines))
     parts = assemble(
-        {
-            "data": {"name": "tabular", "path": str(folder / "table.csv"), "target": "mass", "kind": "real"},
-            "encoder": {"mlp": {"name": "mlp", "widths": [4]}},
-            "density_head": {"name": "gaussian"},
-        }
+        Settings.of(
+            {
+                "data": {
+                    "name": "tabular",
+                    "path": str(folder / "table.csv"),
+                    "target": "mass",
+                    "kind": "real",
+                },
+                "encoder": {"mlp": {"name": "mlp", "widths": [4]}},
+                "density_head": {"name": "gaussian"},
+            }
+        )
     ).parts
     data = build_data(parts)
     data.prepare()

@@ -13,6 +13,7 @@ import framework as package
 from framework.configuration.assembly import assemble, build_outliers
 from framework.configuration.description import Description
 from framework.configuration.schema import build, resolve
+from framework.configuration.settings import Settings
 from framework.distributions.density import Mixture
 from framework.errors import CheckpointError, ConfigError, DataError
 from framework.modes.combine import common_description, find_members, wrapper_config
@@ -178,12 +179,12 @@ def test_outliers_are_built_only_for_metrics_that_read_them() -> None:
     data.prepare()
     broken = {"name": "tabular", "path": "no_such_file.csv", "target": "y", "kind": "class"}
     assert (
-        build_outliers(assemble(chosen(broken, "nll")).parts, data) is None
+        build_outliers(assemble(Settings.of(chosen(broken, "nll"))).parts, data) is None
     )  # the missing file disturbs nobody
     with pytest.raises(DataError, match=r"no_such_file\.csv"):
-        build_outliers(assemble(chosen(broken, "nll", "out_of_distribution")).parts, data)
+        build_outliers(assemble(Settings.of(chosen(broken, "nll", "out_of_distribution"))).parts, data)
     with pytest.raises(ConfigError, match="no outliers are chosen"):
-        assemble(chosen(None, "nll", "out_of_distribution"))
+        assemble(Settings.of(chosen(None, "nll", "out_of_distribution")))
 
 
 def test_outliers_have_the_inputs_of_the_data(tmp_path: Path) -> None:
@@ -194,7 +195,7 @@ def test_outliers_have_the_inputs_of_the_data(tmp_path: Path) -> None:
     data.prepare()
     three = {"name": "tabular", "path": str(table), "target": "label", "kind": "class"}
     with pytest.raises(ConfigError, match=r"shape \(3,\).*shape \(2,\)"):
-        build_outliers(assemble(chosen(three, "out_of_distribution")).parts, data)
+        build_outliers(assemble(Settings.of(chosen(three, "out_of_distribution"))).parts, data)
 
 
 def test_a_mistake_on_the_command_line_is_said_before_training(framework: Framework) -> None:

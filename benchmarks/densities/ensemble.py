@@ -24,7 +24,7 @@ from torch import Tensor
 from benchmarks.pages import machine, publish
 from framework.configuration.assembly import assemble, build_predictor
 from framework.configuration.schema import build, resolve
-from framework.configuration.settings import OptimizerSettings
+from framework.configuration.settings import OptimizerSettings, Settings
 from framework.data import Data
 from framework.model import Model, Predictor
 from framework.training.batches import Batches, epoch_order
@@ -45,7 +45,7 @@ def build_network(data: Data, width: int, seed: int, members: int | None = None)
     }
     if members:
         config["uncertainty"] = {"ensemble": {"name": "ensemble", "members": members}}
-    return build_predictor(assemble(config).parts, data.target, data.input_shape, seed)
+    return build_predictor(assemble(Settings.of(config)).parts, data.target, data.input_shape, seed)
 
 
 def train_bare(

@@ -24,7 +24,7 @@ from benchmarks.pages import machine, publish
 from benchmarks.timing import Rounds, require_idle
 from framework.configuration.assembly import assemble, build_predictor
 from framework.configuration.schema import build, resolve
-from framework.configuration.settings import OptimizerSettings
+from framework.configuration.settings import OptimizerSettings, Settings
 from framework.data import Batch, Splits
 from framework.datasets.fields import Fields
 from framework.model import Predictor
@@ -157,7 +157,9 @@ def time_predictor(case: Case) -> float:
 
 
 def build_case_predictor(case: Case) -> Predictor:
-    return build_predictor(assemble(case.config).parts, case.data.target, case.data.input_shape, seed=0)
+    return build_predictor(
+        assemble(Settings.of(case.config)).parts, case.data.target, case.data.input_shape, seed=0
+    )
 
 
 class Clock(pl.Callback):

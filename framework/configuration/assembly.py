@@ -9,6 +9,7 @@ import torch
 from framework.configuration.citations import bibtex_of
 from framework.configuration.registry import GROUPS, installed, load
 from framework.configuration.schema import build, parts, resolve
+from framework.configuration.settings import Settings
 from framework.data import Data
 from framework.density_head import DensityHead, Fitted
 from framework.encoder import Encoder
@@ -57,22 +58,24 @@ class Assembly:
         return metrics if metrics is not None and target == self.target else build_metrics(self.parts, target)
 
 
-def assemble(config: Mapping[str, Any]) -> Assembly:
-    """Check every plugin of a composed config, and build what can be built before any data is read.
+def assemble(settings: Settings) -> Assembly:
+    """Check every plugin of a config, and build what can be built before any data is read.
 
     Raises:
         ConfigError: A part of the pipeline is missing, or a plugin's name, key or value is wrong.
     """
     for group in ("data", "density_head", "encoder"):
         # a head that is fitted in one step may read the inputs without an encoder
-        if not config.get(group) and not (group == "encoder" and _is_fitted_at_once(config["density_head"])):
+        if not getattr(settings, group) and not (
+            group == "encoder" and _is_fitted_at_once(settings.density_head)
+        ):
             raise ConfigError(
                 f"No {group} is chosen. Name an experiment (`experiment=...`; `--help` lists them), "
                 f"or one of the installed: {group}={'|'.join(installed(group))}."
             )
     resolved: Resolved = {
-        "data": resolve("data", config["data"]),
-        "density_head": resolve("density_head", config["density_head"]),
+        "data": resolve("data", settings.data),
+        "density_head": resolve("density_head", settings.density_head),
     }
     assembly = Assembly(resolved, build_data(resolved))
     assembly.target = target = getattr(assembly.data, "target", None)
@@ -82,15 +85,14 @@ def assemble(config: Mapping[str, Any]) -> Assembly:
         if torch.equal(generator_state, torch.default_generator.get_state()):
             assembly.head = head
     for group in ("encoder", "uncertainty", "objective", "metric"):
-        chosen = config.get(group) or {}
+        chosen = getattr(settings, group) or {}
         if not isinstance(chosen, Mapping):
             raise ConfigError(
                 f"{group} = {quote(chosen)}: expected a mapping from names of your choice to one {group} each. "
                 f"Write {group}=[<name>], or {group}.<key>.name=<name>."
             )
         resolved[group] = [resolve(group, part, f"{group}.{key}") for key, part in chosen.items()]
-    outliers = config.get("outliers")
-    resolved["outliers"] = resolve("data", outliers, "outliers") if outliers else None
+    resolved["outliers"] = resolve("data", settings.outliers, "outliers") if settings.outliers else None
     require_outliers(resolved)
     if target is not None:
         assembly.metrics = build_metrics(resolved, target)

@@ -1,4 +1,4 @@
-"""Config of a command: its composed values, its checked settings, and the folder of its run."""
+"""Config of a command: its checked settings and chosen plugins, and the folder of its run."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict
 
 from framework.configuration.modes import is_below, key_of
 from framework.configuration.schema import check
-from framework.configuration.settings import Settings, settings
+from framework.configuration.settings import Settings
 
 if TYPE_CHECKING:
     from framework.configuration.assembly import Assembly
@@ -32,15 +32,13 @@ class Config:
     """Config of a command, as a mode receives it.
 
     Attributes:
-        values: Composed config as plain values. The run folder stores them, and a run is resumed only if they agree
-            with the stored ones.
-        settings: Checked settings of the core.
+        settings: Checked settings and chosen plugins. The run folder stores them, and a run is resumed only if they
+            agree with the stored ones.
         folder: Folder of the run.
         overrides: Overrides on the command line.
         trained_on: Data set on which the stored model of the command was trained; empty if there is no such model.
     """
 
-    values: Mapping[str, Any]
     settings: Settings
     folder: Path
     overrides: Sequence[str]
@@ -53,7 +51,7 @@ class Config:
         Raises:
             ConfigError: A key is unknown, or a value is out of range.
         """
-        return cls(values, settings(values), folder, overrides)
+        return cls(Settings.of(values), folder, overrides)
 
     @cached_property
     def assembly(self) -> "Assembly":
@@ -64,12 +62,12 @@ class Config:
         """
         from framework.configuration.assembly import assemble  # imports torch, which not every mode needs
 
-        return assemble(self.values)
+        return assemble(self.settings)
 
     @property
     def mode(self) -> str:
         """Return the name of the mode."""
-        return self.values["mode"]["name"]
+        return self.settings.mode["name"]
 
     def options(self, kind: type[Chosen]) -> Chosen:
         """Return the checked options of the mode as an object of class `kind`.
@@ -77,7 +75,7 @@ class Config:
         Raises:
             ConfigError: A key is unknown, or a value is out of range.
         """
-        return kind.model_validate(check(kind, self.values["mode"], "mode"))
+        return kind.model_validate(check(kind, self.settings.mode, "mode"))
 
     def first_override(self, key: str) -> str | None:
         """Return the first override on the command line that sets `key` or a key below it; None if there is none."""

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-from framework.configuration.registry import GROUPS
 from framework.configuration.schema import check, forbid_targets
 from framework.errors import ConfigError
 from framework.tracking.stores import require_no_password
@@ -173,7 +172,11 @@ TRAINER_OURS = {"patience", "checkpoint_every_steps", "log_every_steps", "keep"}
 
 
 class Settings(_Strict):
-    """All keys of a composed config that do not belong to a plugin."""
+    """Composed config of a command: the settings of the core, checked, and the chosen plugins.
+
+    The constructors of the plugins check their parameters (`framework.configuration.assembly`), so that the config of a
+    plugin is any value here. A group from which several plugins may be chosen has a mapping from names to one each.
+    """
 
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     threads: Annotated[int, Field(gt=0, le=MOST_AT_ONCE)] | None = None
@@ -191,6 +194,42 @@ class Settings(_Strict):
     logger: LoggerSettings = LoggerSettings()
     trainer: dict[str, Any] = {}
     mode: dict[str, Any] = {}
+    data: Any = None
+    outliers: Any = None
+    encoder: Any = None
+    density_head: Any = None
+    uncertainty: Any = None
+    objective: Any = None
+    metric: Any = None
+    renderer: Any = None
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> "Settings":
+        """Return the checked settings of a composed config.
+
+        Raises:
+            ConfigError: The config contains `_target_`, a key is unknown, or a value is out of range.
+        """
+        forbid_targets(config)
+        for key, model in (("optimizer", OptimizerSettings), ("logger", LoggerSettings)):
+            if isinstance(config.get(key), Mapping):
+                check(model, config[key], key)
+        check(cls, config, "")
+        settings = cls.model_validate(dict(config))
+        if settings.logger.uri is not None:
+            require_no_password(settings.logger.uri)
+        check(TrainerSettings, settings.trainer, "trainer")
+        return settings
+
+    def plain(self) -> dict[str, Any]:
+        """Return the keys that the composed config sets, as plain values, which the run folder stores."""
+        return self.model_dump(exclude_unset=True)
+
+    @property
+    def bounded_trainer(self) -> dict[str, Any]:
+        """Return `trainer` with a validation interval of at most `max_epochs`, so that a short run is validated too."""
+        every, epochs = self.trainer.get("check_val_every_n_epoch"), self.trainer.get("max_epochs")
+        return self.trainer | ({"check_val_every_n_epoch": min(every, epochs)} if every and epochs else {})
 
 
 def store_experiment(config: Mapping[str, Any], trained_on: str = "") -> str:
@@ -209,29 +248,6 @@ def store_experiment(config: Mapping[str, Any], trained_on: str = "") -> str:
     return str(
         logger.get("experiment") or (name.partition("/")[0] if name else chosen) or trained_on or "Default"
     )
-
-
-def settings(config: Mapping[str, Any]) -> Settings:
-    """Return the checked settings of the core in a composed config.
-
-    Raises:
-        ConfigError: The config contains `_target_`, a key is unknown, or a value is out of range.
-    """
-    forbid_targets(config)
-    own = {key: value for key, value in config.items() if key not in (*GROUPS, "outliers")}
-    for key in ("optimizer", "logger"):
-        model = {"optimizer": OptimizerSettings, "logger": LoggerSettings}[key]
-        if isinstance(own.get(key), Mapping):
-            own[key] = check(model, own[key], key)
-    values = check(Settings, own, "")
-    checked = Settings.model_validate(values)
-    if checked.logger.uri is not None:
-        require_no_password(checked.logger.uri)
-    check(TrainerSettings, checked.trainer, "trainer")
-    every, epochs = checked.trainer.get("check_val_every_n_epoch"), checked.trainer.get("max_epochs")
-    if every and epochs:  # a run with fewer epochs is validated at its end
-        checked.trainer["check_val_every_n_epoch"] = min(every, epochs)
-    return checked
 
 
 def device_of(accelerator: str | None) -> "torch.device":

@@ -35,7 +35,7 @@ def run(config: Config) -> None:
         ConfigError: No wrapper is chosen, or a chosen wrapper must be trained or has been fitted already.
     """
     config.options(CalibrateOptions)
-    wrappers = resolve_wrappers(config.values.get("uncertainty") or {})
+    wrappers = resolve_wrappers(config.settings.uncertainty or {})
     session = for_trained(config)
     existing = [part["name"] for part in session.parts["uncertainty"]]
     for part in wrappers:

@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from framework.configuration.config import Config, Options
+from framework.configuration.settings import Settings
 from framework.errors import ConfigError, UserError
 from framework.reports.table import write_csv
 from framework.testing.contract import CONTRACTS, Contract, Row, contract
@@ -48,7 +49,7 @@ def run(config: Config) -> None:
     config.options(Options)
     # the tensors of most checks are too small for several threads, which would only add processor time
     torch.set_num_threads(config.settings.threads or 1)
-    chosen = _chosen_plugins(config.values)
+    chosen = _chosen_plugins(config.settings)
     if not chosen:
         raise ConfigError(
             "mode=check needs a plugin, but none is chosen. Add one, for example `mode=check density_head=<name>`. "
@@ -90,11 +91,11 @@ def examine(plugin: Contract, console: Console) -> tuple[Table, list[dict[str, o
     return _table(plugin, worst, seconds), lines, failed
 
 
-def _chosen_plugins(values: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
+def _chosen_plugins(settings: Settings) -> list[tuple[str, Mapping[str, Any]]]:
     """Return registry and config of every chosen plugin that has a contract."""
     plugins = []
     for group in CONTRACTS:
-        config = values.get(group)
+        config = getattr(settings, group)
         if not config:
             continue
         parts = [config] if "name" in config else list(config.values())

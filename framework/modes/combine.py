@@ -49,7 +49,7 @@ def run(config: Config) -> None:
         wrapper_config(options.wrapper, len(members)),
         *(
             resolve("uncertainty", part, f"uncertainty.{key}")
-            for key, part in (config.values.get("uncertainty") or {}).items()
+            for key, part in (config.settings.uncertainty or {}).items()
         ),
     ]
     parts = {**shared.config, "uncertainty": [*shared.config["uncertainty"], *wrappers]}

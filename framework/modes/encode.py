@@ -80,11 +80,11 @@ def run(config: Config) -> None:
     """Compute and write this job's parts of the features; parts that already exist are left unchanged."""
     options = config.options(EncodeOptions)
     console = set_up_process(config.settings)
-    values = config.values
     parts = {
-        "data": resolve("data", values.get("data") or {}),
+        "data": resolve("data", config.settings.data or {}),
         "encoder": [
-            resolve("encoder", part, f"encoder.{key}") for key, part in (values.get("encoder") or {}).items()
+            resolve("encoder", part, f"encoder.{key}")
+            for key, part in (config.settings.encoder or {}).items()
         ],
     }
     if not parts["encoder"]:

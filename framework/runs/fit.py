@@ -138,7 +138,7 @@ def _cache_features(session: Session) -> Data:
 
 
 def _trainer(run: Run, keep: KeepCheckpoints, console: Console) -> pl.Trainer:
-    chosen = dict(run.settings.trainer)
+    chosen = run.settings.bounded_trainer
     patience = chosen.get("patience")
     callbacks: list[pl.Callback] = [
         LogMetrics(run.tracker, chosen.get("log_every_steps") or 10),

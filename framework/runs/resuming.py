@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from framework.configuration.config import Config
 from framework.configuration.paths import flatten, paths_of, require_repeated, shell_arguments
+from framework.configuration.settings import Settings
 from framework.errors import ConfigError
 from framework.runs import provenance
 from framework.storage.first_rank import first_rank
@@ -118,18 +119,26 @@ def may_resume(config: Config) -> bool:
         earlier is not None
         and earlier.status != "FINISHED"
         and config.settings.resume != "never"
-        and _same_settings(stored_config(config.folder), config.values)
+        and _same_settings(stored_config(config.folder), config.settings)
     )
 
 
-def _same_settings(stored: Mapping[str, Any] | None, values: Mapping[str, Any]) -> bool:
+def _same_settings(stored: Mapping[str, Any] | None, settings: Settings) -> bool:
     if stored is None:
         return False
-    stored_settings, new_settings = (
-        {key: value for key, value in provenance.flatten(config).items() if key not in ("resume", *HOW)}
-        for config in (stored, values)
+    try:
+        earlier = Settings.of(stored)
+    except ConfigError:  # written by a version with other settings
+        return False
+    earlier_values, values = (
+        {
+            key: value
+            for key, value in provenance.flatten(each.model_dump()).items()
+            if key not in ("resume", *HOW)
+        }
+        for each in (earlier, settings)
     )
-    return stored_settings == new_settings
+    return earlier_values == values
 
 
 def find_resumable(folder: Path) -> Path | None:
@@ -168,7 +177,7 @@ def resume_arguments(run: "Run") -> str:
     # the address of a store and paths are included, because stored ones are used only if the user repeats them
     store = run.settings.logger.uri
     own = [f"resume={run.folder}", *([f"logger.uri={store}"] if store else [])]
-    return " ".join([*map(shlex.quote, own), *shell_arguments(paths_of(run.config.values))])
+    return " ".join([*map(shlex.quote, own), *shell_arguments(paths_of(run.settings.plain()))])
 
 
 def remove_resume_files(run: "Run") -> None:

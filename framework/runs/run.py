@@ -133,7 +133,7 @@ def _begin_folder(config: Config) -> None:
             path.replace(aside / path.name)
     (folder / "checkpoints").mkdir()
     write_whole(folder / "overrides.yaml", yaml.safe_dump(list(config.overrides)).encode())
-    write_whole(folder / "config.yaml", yaml.safe_dump(dict(config.values), sort_keys=False).encode())
+    write_whole(folder / "config.yaml", yaml.safe_dump(config.settings.plain(), sort_keys=False).encode())
 
 
 def _tracker(config: Config, run_id: str | None, resumed: bool) -> Tracker:
@@ -145,7 +145,7 @@ def _tracker(config: Config, run_id: str | None, resumed: bool) -> Tracker:
         config.folder,
         Destination(
             config.settings.logger.uri,
-            store_experiment(config.values, config.trained_on),
+            store_experiment(config.settings.plain(), config.trained_on),
             name,
             parent,
             run_id,
@@ -157,7 +157,7 @@ def _tracker(config: Config, run_id: str | None, resumed: bool) -> Tracker:
 
 def _method(config: Config) -> str | None:
     """Return the name of the density head, which names a training without an experiment; None in other modes."""
-    head = config.values.get("density_head") if config.mode == "train" else None
+    head = config.settings.density_head if config.mode == "train" else None
     return str(head.get("name")) if isinstance(head, Mapping) else None
 
 
@@ -194,7 +194,7 @@ def _describe(run: Run) -> None:
     tags |= {f"version.{key}": value for key, value in package_versions().items()}
     tags |= {"mode": config.mode, "overrides": " ".join(config.overrides), "folder": str(run.folder)}
     run.tracker.set_tags(tags)
-    run.tracker.log_params(flatten(config.values))
+    run.tracker.log_params(flatten(config.settings.plain()))
     run.tracker.log_artifact(run.folder / "config.yaml")
     run.tracker.log_artifact(run.folder / "overrides.yaml")
 

@@ -437,7 +437,9 @@ def for_predictor(
     device = device_of(chosen_device)
     parts: Resolved = {**description.config}
     chosen = {
-        group for group in ("data", "outliers", "metric") if group in reads and config.values.get(group)
+        group
+        for group in ("data", "outliers", "metric")
+        if group in reads and getattr(config.settings, group)
     }
     # the groups that the mode does not read are left as they are, and their plugins are not imported
     stored_parts = {
@@ -455,9 +457,9 @@ def for_predictor(
     }
     config = replace(inherit_settings(config, description), trained_on=str(parts["data"]["name"]))
     for group in chosen - {"metric"}:
-        parts[group] = resolve("data", config.values[group], group)
+        parts[group] = resolve("data", getattr(config.settings, group), group)
     if "metric" in chosen:
-        metrics = config.values["metric"]
+        metrics = config.settings.metric
         parts["metric"] = [resolve("metric", part, f"metric.{key}") for key, part in metrics.items()]
     if "outliers" in reads and not may_resume(config):
         refuse_unread_outliers(config, parts)
@@ -552,7 +554,6 @@ def inherit_settings(config: Config, description: Description) -> Config:
     }
     return replace(
         config,
-        values={**config.values, **inherited_values},
         settings=config.settings.model_copy(update=inherited_values),
     )
 
