@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from framework.errors import CheckpointError, ConfigError
-from framework.storage.weights import ABOVE_0, FINITE, FROM_0, fill_from_file, read_weights, require_state
+from framework.storage.weights import FINITE, FROM_0, LARGEST, fill_from_file, read_weights, require_state
 
 
 def network():
@@ -243,7 +243,7 @@ class Calibrated(nn.Module):
 
 
 @pytest.mark.parametrize("shape", [(), (3,)])
-@pytest.mark.parametrize("bounds", [ABOVE_0, FROM_0, FINITE, (-math.inf, math.inf), (-2.0, 0.5)])
+@pytest.mark.parametrize("bounds", [(1e-300, LARGEST), FROM_0, FINITE, (-math.inf, math.inf), (-2.0, 0.5)])
 def test_a_stored_buffer_is_taken_within_its_bounds_only(bounds, shape):
     """NaN, other shapes and other types are refused; a single number must not be a row of one."""
     whole = torch.full(shape, 0.25, dtype=torch.float64)

@@ -62,11 +62,6 @@ class Interval(NamedTuple):
     low_error: Tensor
     high_error: Tensor
 
-    @property
-    def depends_on_draws(self) -> bool:
-        """True if an end depends on random draws."""
-        return bool(((self.low_error != 0) | (self.high_error != 0)).any())
-
 
 @torch.no_grad()
 def central_interval(density: Distribution, mass: float, draws: int = DRAWS) -> Interval:

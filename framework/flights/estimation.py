@@ -84,7 +84,6 @@ def estimate_states(
     constants: Constants,
     noise: float,
     prior: Prior = Prior(),  # noqa: B008 - never changed
-    start: Float[Tensor, "flight 9"] | None = None,
     most: int = 40,
 ) -> Estimate:
     """Return the most likely state of each flight.
@@ -97,7 +96,6 @@ def estimate_states(
         constants: constants of the physics.
         noise: standard deviation of the noise in each coordinate, m.
         prior: prior density of a state.
-        start: start of the search; None: `guess_states`.
         most: largest number of steps of the search.
     """
     scale = prior.scale.to(frames.times.device)
@@ -110,7 +108,7 @@ def estimate_states(
         own = torch.diag_embed((1 / scale).expand(len(states), 9))
         return torch.cat([bent, states / scale], 1), torch.cat([jacobian, own], 1)
 
-    begin = guess_states(frames, constants.gravity) if start is None else start
+    begin = guess_states(frames, constants.gravity)
     bound = MOST.to(frames.times.device)
     # An error of a tenth of a per cent of a standard deviation does not matter.
     solution = least_squares(model, begin, -bound, bound, most=most, decrease=1e-7, step=1e-9)

@@ -3,7 +3,7 @@
 from enum import IntEnum
 from typing import NamedTuple
 
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 
@@ -49,8 +49,3 @@ class Solution(NamedTuple):
     rank: Int[Tensor, "problem"]
     status: Int[Tensor, "problem"]
     steps: Int[Tensor, "problem"]
-
-    @property
-    def well_posed(self) -> Bool[Tensor, "problem"]:
-        """True for each problem that ended at a minimum that the data determine, (problem,)."""
-        return self.status > 0

@@ -49,7 +49,7 @@ def half_width(*points: Float[np.ndarray, "_ 2"]) -> float:
 
 
 @torch.no_grad()
-def probabilities(predictor: Predictor, half_width: float, rows_at_once: int = 4096) -> np.ndarray:
+def probabilities(predictor: Predictor, half_width: float) -> np.ndarray:
     """Return the number to draw at each grid point of the plane, (POINTS, POINTS); the first row is at the bottom.
 
     For two classes it is p(y = 1); for K > 2 classes, the entropy divided by its largest value, log K.
@@ -57,7 +57,7 @@ def probabilities(predictor: Predictor, half_width: float, rows_at_once: int = 4
     axis = torch.linspace(-half_width, half_width, POINTS)
     plane = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1).reshape(-1, 2)
     values = []
-    for part in plane.split(rows_at_once):
+    for part in plane.split(4096):
         density = predictor(part)
         log_prob = density.log_prob(density.enumerate_support()).double()
         if len(log_prob) == 2:

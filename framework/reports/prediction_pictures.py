@@ -24,8 +24,8 @@ from framework.runs.session import Session
 
 PICTURED = 128
 """Number of test samples from which the samples of a figure are chosen."""
-
-
+POINTS = 720
+"""Number of angles at which a density on the circle is drawn."""
 UNRESOLVED, DRAWS, TIMES = 0.01, 1000, 10
 """Largest difference from 1 of a density's integral over a grid, at which the grid counts as fine enough.
 
@@ -128,19 +128,19 @@ def _landscape_figure(session: Session) -> Figure:
     )
 
 
-def log_density_on_circle(density: Distribution, points: int = 720) -> tuple[Tensor, Tensor]:
-    """Return a grid of angles (points,), and the log-densities at them (points, batch), also of very narrow densities.
+def log_density_on_circle(density: Distribution) -> tuple[Tensor, Tensor]:
+    """Return POINTS angles, and the log-densities at them (POINTS, batch), also of very narrow densities.
 
     A density that is too narrow for the grid is estimated from the share of its random values in each grid cell.
     """
-    angles, log_density = circular_grid(density, points)
-    width = 2 * math.pi / points
+    angles, log_density = circular_grid(density, POINTS)
+    width = 2 * math.pi / POINTS
     on_grid = DRAWS * TIMES * width * log_density.double().exp()  # expected number of draws
     unresolved = (on_grid.sum(0) / (DRAWS * TIMES) - 1).abs() > UNRESOLVED
     if not bool(unresolved.any()):
         return angles, log_density
     values = torch.cat([density.sample(torch.Size((DRAWS,))) for _ in range(TIMES)]).squeeze(-1)
-    cell = ((wrap(values).double() + math.pi) / width).round().long() % points
+    cell = ((wrap(values).double() + math.pi) / width).round().long() % POINTS
     counts = torch.zeros_like(on_grid).scatter_add_(0, cell, torch.ones_like(cell, dtype=on_grid.dtype))
     # The grid's values are kept unless the random values contradict them, so that tails stay smooth.
     contradicted = unresolved & ((counts - on_grid).abs() > 5 * (on_grid + 1).sqrt())

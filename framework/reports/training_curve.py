@@ -21,7 +21,6 @@ def training_curve(
     best_epoch: int | float | None,
     title: str,
     synthetic: bool,
-    y_label: str = "loss (nats per sample)",
 ) -> Figure:
     """Draw training and validation loss over epochs, and mark the epoch of the kept weights.
 
@@ -32,7 +31,6 @@ def training_curve(
         best_epoch: epoch of the kept weights; None if no weights were kept.
         title: title of the figure.
         synthetic: whether the data are generated.
-        y_label: label of the axis of losses.
     """
     figure = titled_figure((7.0, 4.3), title, synthetic)
     axes = figure.subplots()
@@ -49,7 +47,7 @@ def training_curve(
             axes.set_yscale("symlog", linthresh=usual)
     if best_epoch is not None:
         axes.axvline(best_epoch, color=GREEN, linestyle="--", label=f"kept weights: epoch {best_epoch:g}")
-    axes.set(xlabel="epoch", ylabel=y_label)
+    axes.set(xlabel="epoch", ylabel="loss (nats per sample)")
     axes.set_xlim(0, 1.03 * max([1, *epochs, *validated[:, 0]]))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3)

@@ -80,7 +80,7 @@ def require_plain_within(file: Path, folder: Path, error: type[UserError] = Data
             raise error(f"{shorten(path)} is {fault}. {REMEDY}")
 
 
-def open_plain(path: Path, flags: int, mode: int = 0o644) -> int:
+def open_plain(path: Path, flags: int) -> int:
     """Open a file of a run folder as `os.open` does, but never through a link, and return the descriptor.
 
     `flags` must not contain O_TRUNC, which would truncate the file before this function has checked it.
@@ -92,7 +92,7 @@ def open_plain(path: Path, flags: int, mode: int = 0o644) -> int:
     assert not flags & os.O_TRUNC
     try:
         # without O_NONBLOCK, opening a pipe would wait for its other end
-        descriptor = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, mode)
+        descriptor = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o644)
     except OSError:
         if path.is_symlink():
             raise DataError(f"{shorten(path)} is a link. {REMEDY}") from None

@@ -179,8 +179,8 @@ def describe_mismatch(
 
 
 LARGEST = torch.finfo(torch.float64).max
-FINITE, FROM_0, ABOVE_0 = (-LARGEST, LARGEST), (0.0, LARGEST), (torch.finfo(torch.float64).tiny, LARGEST)
-"""Bounds (least, largest) of a buffer for `require_state`: any finite number; at least 0; above 0."""
+FINITE, FROM_0 = (-LARGEST, LARGEST), (0.0, LARGEST)
+"""Bounds (least, largest) of a buffer for `require_state`: any finite number; at least 0."""
 
 
 def require_state(module: nn.Module, **bounds: tuple[float, float] | tuple[Tensor, Tensor]) -> None:

@@ -28,10 +28,10 @@ draws. Chance exceeds this value once in 10⁶ comparisons.
 """
 
 
-def draws_and_mode(density: Distribution, count: int = 6) -> Tensor:
-    """Return `count` draws and the mode, (count + 1, *batch, *event)."""
+def draws_and_mode(density: Distribution) -> Tensor:
+    """Return six draws and the mode, (7, *batch, *event)."""
     seed(SEED + 3)
-    draws = density.sample(torch.Size((count,)))
+    draws = density.sample(torch.Size((6,)))
     return torch.cat([draws, density.mode.unsqueeze(0).to(draws)])
 
 
