@@ -333,7 +333,7 @@ def add_test_parts(session: Session) -> Session:
     return _add_metrics(replace(session, parts=parts), build_metrics(parts, session.target))
 
 
-def _add_metrics(session: Session, metrics: Sequence[Metric]) -> Session:
+def _add_metrics(session: Session, metrics: "Sequence[Metric]") -> Session:
     owners: dict[str, Metric] = {}
     for metric in metrics:
         for name in metric.columns:
