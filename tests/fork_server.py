@@ -1,4 +1,4 @@
-"""Runs `python -m framework` in forks of one process that has imported torch and Lightning, which takes 4 s each time.
+"""Runs `python -m framework` in forks of one process that has imported what runs import, which takes 5 s each time.
 
 Each line of standard input is a command as JSON: its arguments, environment, working directory, folders of packages and
 the file its output goes to. The answer to each is its exit code, or minus the signal that killed it. A fork owns all
@@ -14,8 +14,16 @@ import sys
 from multiprocessing import get_context
 from typing import Any
 
-import hydra  # noqa: F401
+import hydra.main  # noqa: F401
+import matplotlib.backends.backend_agg  # noqa: F401
 import pytorch_lightning  # noqa: F401
+
+import framework.app
+import framework.configuration.command_line
+import framework.modes.predict
+import framework.modes.train
+import framework.reports.prediction_pictures
+import framework.reports.training_curve  # noqa: F401
 
 
 def run(

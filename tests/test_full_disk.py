@@ -24,7 +24,7 @@ def one_sentence(done: Done) -> str:
 def test_a_disk_that_is_full_ends_a_run_with_a_sentence(size: int, at: str, framework: Framework) -> None:
     """No file longer than `size` bytes can be written, so the run fails during training, after it, or when it draws
     figures."""
-    done = framework(*TINY, f"+data.longest_file={size}", "logger=none", *STEPS)
+    done = framework(*TINY, "pictures=true", f"+data.longest_file={size}", "logger=none", *STEPS)
     said = one_sentence(done)
     assert at in said, said
     assert "ree some space" in said, said
@@ -42,12 +42,16 @@ def test_a_disk_that_is_full_from_the_start(stranger_site: Path, tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_a_full_store_stops_nobody(framework: Framework) -> None:
-    done = framework(*TINY, "+data.longest_file=100000", "pictures=false", *STEPS)
+def test_a_full_store_stops_nobody(framework: Framework, stranger_site: Path, tmp_path: Path) -> None:
+    """The run waits 5 s for the store when it closes, not a minute."""
+    impatient = "from framework.tracking.tracker import MlflowTracker as tracker\n"
+    impatient += "tracker.__init__.__kwdefaults__['patience'] = 5.0\n"
+    arguments = (*TINY, "+data.longest_file=100000", *STEPS, f"hydra.run.dir={tmp_path / 'run'}")
+    done = listed(*arguments, folder=tmp_path, site=stranger_site, before=impatient)
     assert done.code == 0, done.out
     assert "mode=sync" in done.out
     assert "Traceback" not in done.out
-    sent = framework("mode=sync", f"mode.run={done.folder}", folder="sync")
+    sent = framework("mode=sync", f"mode.run={tmp_path / 'run'}", folder="sync")
     assert sent.code == 0, sent.out
 
 

@@ -46,7 +46,7 @@ def stored_statuses(done: Done) -> list[str]:
 def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(
     framework: Framework, whole: Done
 ) -> None:
-    again = framework(*QUIET, "workers=2", folder="again")
+    again = framework(*QUIET, "workers=2", "pictures=true", folder="again")
     other = framework(*QUIET, "seed=1", folder="other")
     assert again.code == 0, again.out
     assert again.losses() == whole.losses()
@@ -133,7 +133,7 @@ def test_a_run_killed_after_it_stopped_early_trains_no_further(
     framework: Framework, tmp_path: Path, every: int, further: list[str]
 ) -> None:
     killed = framework(
-        *(*QUIET, *STOPS, *further, f"trainer.check_val_every_n_epoch={every}"),
+        *(*QUIET, "pictures=true", *STOPS, *further, f"trainer.check_val_every_n_epoch={every}"),
         *("+data.signal_at=0", f"+data.signal_marker={tmp_path / 'marker'}"),
     )
     assert killed.code == -signal.SIGKILL, "in its pictures"
@@ -151,7 +151,7 @@ def test_a_run_killed_after_it_stopped_early_trains_no_further(
 
 def test_a_killed_run_still_knows_how_long_it_has_waited(framework: Framework, tmp_path: Path) -> None:
     """The run is killed in the epoch after its first validation without improvement; the second one would end it."""
-    patient = [*QUIET, *STOPS, "trainer.patience=2", "pictures=false"]
+    patient = [*QUIET, *STOPS, "trainer.patience=2"]
     whole = framework(*patient, folder="whole")
     assert whole.code == 0, whole.out
     validated = list(whole.values("validation/loss").items())
@@ -334,7 +334,8 @@ def test_test_and_predict_repeat_what_training_reported(framework: Framework) ->
     wrapped = ["uncertainty=[mc_dropout]", "uncertainty.mc_dropout.samples=2", "samples=20"]
     metrics = "metric=[log_likelihood,angular_deviation,crps]"
     trained = framework(
-        "data=dial", *drawn, *wrapped, metrics, "batch_size=16", "trainer.max_epochs=1", "logger=none"
+        *("data=dial", *drawn, *wrapped, metrics, "batch_size=16", "trainer.max_epochs=1", "logger=none"),
+        "pictures=false",
     )
     assert trained.code == 0, trained.out
 
@@ -348,7 +349,7 @@ def test_test_and_predict_repeat_what_training_reported(framework: Framework) ->
         others = {"milliseconds", "memory", "folder", "columns", "better", "seconds"}
         return {key: value for key, value in found.items() if not any(word in key for word in others)}
 
-    test = ("mode=test", f"checkpoint={trained.folder}", "logger=none")
+    test = ("mode=test", f"checkpoint={trained.folder}", "logger=none", "pictures=false")
     wanted = numbers(trained)
     assert wanted["method"] == "scvae + mc_dropout"
     assert numbers(framework(*test, folder="tested")) == wanted
@@ -391,22 +392,19 @@ print(tuple(density.batch_shape), model.training, "hydra" in sys.modules, "mlflo
     assert printed.stdout.split("\n")[-2] == "(3,) False False False", printed.stdout + printed.stderr
 
 
-def test_a_run_imports_only_what_it_names(stranger_site: Path, tmp_path: Path) -> None:
+def test_a_run_imports_only_what_it_names_and_is_stored_with_all_it_needs_to_be_repeated(
+    stranger_site: Path, tmp_path: Path
+) -> None:
     run = f"hydra.run.dir={tmp_path / 'run'}"
-    done = listed(*TINY, "trainer.max_epochs=1", run, folder=tmp_path, site=stranger_site)
-    assert done.code == 0, done.out
-    assert stored_statuses(Done(0, "", tmp_path / "run")) == ["FINISHED"], "another process has sent it"
-    plugins = {".".join(name.split(".")[1:3]) for name in done.modules if name.startswith("plugins.")}
+    listing = listed(*TINY, "pictures=true", run, folder=tmp_path, site=stranger_site)
+    assert listing.code == 0, listing.out
+    plugins = {".".join(name.split(".")[1:3]) for name in listing.modules if name.startswith("plugins.")}
     assert plugins - {"encoder", "metric"} == {"encoder.mlp", "metric.log_likelihood", "metric.angular"}
     assert not {"mlflow", "numba", "trimesh", "sklearn", "kornia"} & {
-        name.split(".")[0] for name in done.modules
+        name.split(".")[0] for name in listing.modules
     }
-
-
-def test_a_finished_run_is_in_the_store_with_all_it_needs_to_be_repeated(framework: Framework) -> None:
-    done = framework(*TINY)
-    assert done.code == 0, done.out
-    assert stored_statuses(done) == ["FINISHED"]
+    done = Done(0, listing.out, tmp_path / "run")
+    assert stored_statuses(done) == ["FINISHED"], "another process has sent it"
     with closing(sqlite3.connect(store_of(done))) as store:
         steps = store.execute("select count(*) from metrics where key = 'train/loss'").fetchone()[0]
         tags = dict(store.execute("select key, value from tags").fetchall())
@@ -418,13 +416,13 @@ def test_a_finished_run_is_in_the_store_with_all_it_needs_to_be_repeated(framewo
     assert parameters["density_head.name"] == "wrapped_cauchy"
 
 
-@pytest.mark.slow  # it waits half a minute
+@pytest.mark.slow
 def test_a_store_locked_while_training_costs_no_number(framework: Framework) -> None:
     first = framework(*TINY, "trainer.max_epochs=1", folder="first")
     assert first.code == 0, first.out
     store = sqlite3.connect(store_of(first), check_same_thread=False, isolation_level=None)
     store.execute("begin exclusive")
-    released = threading.Timer(30, lambda: store.execute("rollback"))
+    released = threading.Timer(22, lambda: store.execute("rollback"))  # MLflow tries for 20 s
     released.start()
     try:
         second = framework(*TINY, folder="second")
@@ -548,7 +546,7 @@ def test_a_sweep_that_was_killed_closes_its_parent_when_it_is_repeated(
     stranger_site: Path, tmp_path: Path
 ) -> None:
     sweep = tmp_path / "outputs" / "sweep"
-    arguments = ["-m", *TINY, "trainer.max_epochs=1", "seed=0", "pictures=false", f"hydra.sweep.dir={sweep}"]
+    arguments = ["-m", *TINY, "trainer.max_epochs=1", "seed=0", f"hydra.sweep.dir={sweep}"]
     command = [sys.executable, "-m", "framework", *arguments]
     options: dict[str, Any] = {
         "cwd": tmp_path,

@@ -87,7 +87,7 @@ def test_runs_sweeps_and_sync_keep_the_store_in_their_folder(
     base = tmp_path / "home" / ALL
     base.mkdir(parents=True)
     framework = command(forks, stranger_site, base)
-    swept = framework("-m", *TINY, "trainer.max_epochs=1", "pictures=false", folder=None)
+    swept = framework("-m", *TINY, "trainer.max_epochs=1", folder=None)
     assert swept.code == 0, swept.out
     database = base / "outputs" / "mlflow.db"
     with sqlite3.connect(database) as store:

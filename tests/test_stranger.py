@@ -4,16 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import TINY, Framework
+from tests.conftest import TINY, Done, Framework
 
 
-def test_a_strangers_head_and_data_run_by_name(framework: Framework) -> None:
-    done = framework(*TINY, "logger=none")
-    assert done.code == 0, done.out
-    assert "wrapped_cauchy" in (done.folder / "config.yaml").read_text(encoding="utf-8")
-    assert "log-likelihood" in done.out.lower()
-    assert "synthetic" in done.out
-    assert "Mardia" in (done.folder / "citations.bib").read_text(encoding="utf-8")
+def test_a_strangers_head_and_data_run_by_name(framework: Framework, whole: Done) -> None:
+    assert "wrapped_cauchy" in (whole.folder / "config.yaml").read_text(encoding="utf-8")
+    assert "log-likelihood" in whole.out.lower()
+    assert "synthetic" in whole.out
+    assert "Mardia" in (whole.folder / "citations.bib").read_text(encoding="utf-8")
     listed = framework("mode=plugins")
     assert "wrapped_cauchy" in listed.out or "One wrapped Cauchy" in listed.out
 
