@@ -49,17 +49,17 @@ sweep.COMMAND = json.loads(os.environ["JOB"])
 
 def meet(jobs):
     (HERE / f"rehearsed {os.getpid()}").touch()
-    while len(list(HERE.glob("rehearsed *"))) < int(os.environ["MEET"]):
+    while len(list(HERE.glob("rehearsed *"))) < int(os.environ.get("MEET", 0)):
         time.sleep(0.005)
+
+# the real module imports torch, and checks only jobs that train
+sys.modules["framework.sweeps.rehearsal"] = types.SimpleNamespace(refuse_mistakes=meet)
 
 if "IMPORTS" in os.environ:
     import functools
     from framework.sweeps import processes
     imports = os.environ["IMPORTS"].split(",")
     processes.Forks = functools.partial(lambda kind, modules: kind(imports), processes.Forks)
-
-if "MEET" in os.environ:
-    sys.modules["framework.sweeps.rehearsal"] = types.SimpleNamespace(refuse_mistakes=meet)
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 def run(config):
