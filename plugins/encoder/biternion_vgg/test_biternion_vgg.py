@@ -67,15 +67,6 @@ def test_is_the_published_network():
     assert encoder.output_shape == (512,)
 
 
-def test_bytes_and_an_empty_batch_in_training():
-    torch.manual_seed(0)
-    encoder = BiternionVGG((3, 40, 36), convolution_dropout=0.0, dropout=0.0).train()
-    pixels = torch.randint(0, 256, (4, 3, 40, 36), dtype=torch.uint8)
-    torch.testing.assert_close(encoder(pixels), encoder(pixels.float() / 255))
-    assert encoder.double()(pixels).dtype == torch.float64
-    assert encoder(torch.rand(0, 3, 40, 36)).shape == (0, 512)
-
-
 @pytest.mark.parametrize("convolutions, side", [(1, 3), (2, 5), (3, 10), (4, 14), (6, 32), (8, 68)])
 def test_the_smallest_image_works_and_a_smaller_one_is_refused(convolutions, side):
     channels = [2] * convolutions

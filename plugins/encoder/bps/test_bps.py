@@ -625,11 +625,3 @@ def test_clouds_that_were_not_normalised_are_refused_by_none(factor):
         DataError, match=r"Cloud 0 of the batch extends to .* encoder bps with normalise=none"
     ):
         encoder(clouds * factor)
-
-
-@pytest.mark.parametrize("rotation_invariant", [False, True])
-def test_an_empty_batch_has_no_features(rotation_invariant):
-    encoder = build_encoder(
-        basis="grid", points=27, features=["distance", "delta"], rotation_invariant=rotation_invariant
-    )
-    assert encoder(torch.zeros(0, 40, 3)).shape == (0, 4, 3, 3, 3)

@@ -62,12 +62,6 @@ def test_wild_points_also_outside_of_the_cube(points, side, truncation):
     np.testing.assert_allclose(features, by_hand(cloud.numpy(), side, truncation), rtol=0, atol=1e-7)
 
 
-def test_padding_and_attributes_change_nothing():
-    clouds = batch_of([20, 6], 5)
-    encoder = build_encoder(side=8)
-    assert torch.equal(encoder(clouds)[1], encoder(clouds[1:, :6, :3])[0])
-
-
 def test_the_gradient_agrees_with_finite_differences_and_is_finite_at_a_centre():
     clouds = batch_of([7, 7]).requires_grad_()
     assert torch.autograd.gradcheck(

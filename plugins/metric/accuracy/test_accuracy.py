@@ -63,12 +63,6 @@ def test_one_class_batches_and_probabilities_of_zero_and_one():
     assert compute_metric(certain, [1] * 8) == {"accuracy": 0.0, "accuracy_sem": 0.0}
 
 
-def test_no_samples_give_nan():
-    assert all(
-        math.isnan(value) for value in compute_metric(torch.zeros(0, 3), np.zeros(0, dtype=int)).values()
-    )
-
-
 def test_nan_wrong_labels_and_wrong_densities_raise_a_clear_message():
     with pytest.raises(UserError, match="1 of 2 predicted distributions over classes"):
         compute_metric(torch.tensor([[0.0, 1.0], [0.0, torch.nan]]), [0, 1])

@@ -75,12 +75,6 @@ def test_a_mixture_is_evaluated_with_averaged_probabilities():
     assert metric.compute()["brier"].item() == pytest.approx(0.25, abs=1e-7)
 
 
-def test_no_samples_give_nan():
-    assert all(
-        math.isnan(value) for value in compute_metric(torch.zeros(0, 3), np.zeros(0, dtype=int)).values()
-    )
-
-
 def test_nan_wrong_labels_and_wrong_targets_raise_a_clear_message():
     with pytest.raises(UserError, match="2 of 2 predicted distributions over classes"):
         compute_metric(torch.full((2, 2), torch.nan), [0, 1])

@@ -251,19 +251,6 @@ def test_results_for_one_sample_and_for_none():
     )
 
 
-def test_two_processes_give_the_results_of_all_samples():
-    generator = np.random.default_rng(0)
-    probability, label = with_complement(generator.uniform(size=30)), generator.integers(2, size=30)
-    first, second = CalibrationError(TWO), CalibrationError(TWO)
-    first.update(make_prediction(probability[:11], label[:11]))
-    first.update(make_prediction(probability[11:15], label[11:15]))
-    second.update(make_prediction(probability[15:], label[15:]))
-    first.dist_sync_fn = lambda state, group=None: [state, second.samples[0]]
-    first.distributed_available_fn = lambda: True
-    actual = {name: value.item() for name, value in first.compute().items()}
-    assert actual == pytest.approx(compute_metric(make_prediction(probability, label)), abs=1e-14)
-
-
 def test_unsuitable_targets_and_settings_raise_an_error():
     with pytest.raises(ConfigError, match=r"has 3: a, b, c\. Choose probability=predicted"):
         CalibrationError(Target("class", ("a", "b", "c")), probability="positive")

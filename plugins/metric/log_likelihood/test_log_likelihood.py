@@ -1,4 +1,3 @@
-import copy
 import statistics
 
 import numpy as np
@@ -125,13 +124,6 @@ def split_and_whole():
     return first, second, whole.compute()
 
 
-def test_merged_states_equal_the_state_of_all_samples():
-    first, second, whole = split_and_whole()
-    first.merge_state(second)
-    for name, value in first.compute().items():
-        torch.testing.assert_close(value, whole[name], rtol=1e-12, atol=0)
-
-
 def test_two_processes_give_the_results_of_all_samples():
     first, second, whole = split_and_whole()
     idle = LogLikelihood()  # a process without samples
@@ -143,16 +135,6 @@ def test_two_processes_give_the_results_of_all_samples():
     first.dist_sync_fn, first.distributed_available_fn = gather, lambda: True
     for name, value in first.compute().items():
         torch.testing.assert_close(value, whole[name], rtol=1e-12, atol=0)
-
-
-def test_reset_clears_the_metric_but_not_its_copy():
-    metric = LogLikelihood()
-    metric.update(prediction([1.0, 2.0]))
-    copied = copy.deepcopy(metric)
-    metric.reset()
-    metric.update(prediction([5.0, 7.0]))
-    assert metric.compute()["log_likelihood"] == 6.0
-    assert copied.compute()["log_likelihood"] == 1.5
 
 
 def test_moments_of_parts_in_any_order():

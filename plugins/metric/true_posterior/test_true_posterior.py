@@ -108,12 +108,6 @@ def test_the_true_posterior_has_all_modes_wherever_it_lies(azimuth_deg, modes):
     assert actual["azimuth_entropy"] == pytest.approx(vonmises.entropy(5e4) + math.log(modes), abs=1e-5)
 
 
-def test_359_degrees_is_next_to_1_degree():
-    actual = compute_metric(prediction([[math.radians(359)]], 1e4, [math.radians(1)], [2]))
-    assert actual["mode_mass_0_of_2"] == pytest.approx(1, abs=1e-6)
-    assert actual["mode_mass_1_of_2"] == pytest.approx(0, abs=1e-6)
-
-
 def test_a_missed_mode_lowers_the_smallest_mean_mass():
     azimuth = torch.zeros(10)
     centres = torch.zeros(10, 1)
@@ -178,22 +172,6 @@ def test_no_samples_give_nan():
     assert not np.isnan(unsymmetric["azimuth_entropy"])
     assert np.isnan(unsymmetric["mode_mass_min"])
     assert np.isnan(unsymmetric["uniform_gap"])
-
-
-def test_merged_states_equal_the_state_of_all_samples():
-    generator = np.random.default_rng(0)
-    modes, azimuth = generator.uniform(-3, 3, (20, 2)), generator.uniform(-3, 3, 20)
-    symmetry = generator.integers(0, 4, 20)
-    first, second, whole = (TruePosterior(TARGET) for _ in range(3))
-    first.update(prediction(modes[:7], 8.0, azimuth[:7], symmetry[:7]))
-    second.update(prediction(modes[7:], 8.0, azimuth[7:], symmetry[7:]))
-    whole.update(prediction(modes, 8.0, azimuth, symmetry))
-    first.merge_state(second)
-    expected = whole.compute()
-    actual = first.compute()
-    assert actual.keys() == expected.keys()
-    for name, value in actual.items():
-        torch.testing.assert_close(value, expected[name], rtol=1e-12, atol=1e-12)
 
 
 def test_data_without_symmetry_raise_an_error():

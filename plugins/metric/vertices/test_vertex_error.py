@@ -82,13 +82,6 @@ def test_no_samples_give_nan_and_a_perfect_prediction_gives_0():
     assert set(actual.values()) == {0.0}
 
 
-def test_nan_predictions_give_nan():
-    point = torch.tensor([[0.0, math.nan, 0.0], [0.0, 0.0, 0.0]])
-    actual = compute_metric((point, torch.zeros(2, 3), torch.ones(2)), vertices=1)
-    assert math.isnan(actual["vertex_error_cm"])
-    assert actual["vertex_error_95_cm"] > 9e3
-
-
 def test_targets_and_data_that_are_no_meshes_raise_an_error():
     with pytest.raises(ConfigError, match="describes targets of kind 'real'"):
         VertexError(Target("angle", ("azimuth",)))

@@ -18,8 +18,6 @@ from framework.distributions.tempering import temper
 from framework.errors import ConfigError, UserError
 from framework.model import Predictor
 from framework.target import Target
-from framework.testing.densities import integral, samples_follow_log_prob
-from framework.testing.finding import Worst
 from framework.testing.metrics import Cardioid
 from framework.testing.plain import Plain
 
@@ -247,21 +245,6 @@ def test_training_does_not_see_it():
     assert torch.equal(wrapper.loss(inputs, label), model.loss(inputs, label))
     assert torch.equal(wrapper.training_densities(inputs).logits, model(inputs).logits)
     assert wrapper.knobs == {} and set(wrapper.state_dict()) >= {"temperature"}
-
-
-def test_calibrated_angles_of_the_contract_are_densities():
-    torch.manual_seed(4)
-    wrapper = around(Plain(ANGLE), ANGLE).eval()
-    inputs = torch.randn(200, 6)
-    with torch.no_grad():
-        target = wrapper(inputs).mode + 0.5 * torch.randn(200, 1)
-    wrapper.calibrate(once(inputs, target))
-    assert 0.05 < wrapper.temperature.item() < 0.5
-    with torch.no_grad():
-        for check, limit in ((integral, 1e-5), (samples_follow_log_prob, 5.0)):
-            worst = Worst()
-            check(wrapper(inputs[:3]), worst)
-            assert worst.error <= limit
 
 
 @settings(max_examples=40, deadline=None)
