@@ -427,13 +427,23 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-def main(folder: Path) -> None:
-    """Run every case in a fork of one process, so that Lightning is imported only once."""
+OFTEN = (
+    "mid-epoch",
+    "checkpoint on an epoch's last batch, 2 workers",
+    "exception, 2 workers",
+    "accumulated gradients",
+    "overfitting",
+)
+"""Cases that are always tested; the others are slow tests."""
+
+
+def main(folder: Path, names: Sequence[str]) -> None:
+    """Run the named cases in forks of one process, so that Lightning is imported only once."""
     torch.set_num_threads(1)
     gc.freeze()  # so that collecting a fork's garbage copies none of these pages
     wholes: dict[str, Path] = {}
-    for name, case in CASES.items():
-        here = folder / name
+    for name in names:
+        case, here = CASES[name], folder / name
         # Trainings that differ only in workers and where they stop share the uninterrupted one.
         key = json.dumps(case.get("trainer", {}))
         if key not in wholes:
@@ -454,22 +464,34 @@ def forked(folder: Path, case: dict[str, Any], resume: Path | None) -> None:
     os.waitpid(process, 0)
 
 
-@pytest.fixture(scope="module")
-def trainings(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
-    def trained(folder: Path) -> None:
-        command = [sys.executable, "-W", "ignore", __file__, str(folder)]
-        subprocess.run(command, check=True, capture_output=True, timeout=900)
+Trainings = Callable[[str], Path]
 
-    return once("trainings", trained)
+
+@pytest.fixture(scope="module")
+def trainings(once: Callable[[str, Callable[[Path], None]], Path]) -> Trainings:
+    """Return a function that returns the folder of a case, after all cases that are tested with it have been run."""
+
+    def trained(name: str) -> Path:
+        names = [case for case in CASES if (case in OFTEN) == (name in OFTEN)]
+
+        def train_all(folder: Path) -> None:
+            command = [sys.executable, "-W", "ignore", __file__, str(folder), *names]
+            subprocess.run(command, check=True, capture_output=True, timeout=900)
+
+        return once(f"trainings, {len(names)}", train_all) / name
+
+    return trained
 
 
 def history(folder: Path, stage: str) -> list[Any]:
     return [json.loads(line) for line in (folder / f"{stage}.jsonl").read_text().splitlines()]
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_a_resumed_training_gives_the_bits_of_the_uninterrupted(name: str, trainings: Path) -> None:
-    folder = trainings / name
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in OFTEN else pytest.mark.slow) for name in CASES]
+)
+def test_a_resumed_training_gives_the_bits_of_the_uninterrupted(name: str, trainings: Trainings) -> None:
+    folder = trainings(name)
     whole = Path(json.loads((folder / "whole.json").read_text()))
     expected = history(whole, "train")
     before = history(folder / "stopped", "train")
@@ -486,16 +508,16 @@ def test_a_resumed_training_gives_the_bits_of_the_uninterrupted(name: str, train
         assert validations == expected[len(expected) - len(validations) :]
 
 
-def test_every_epoch_has_its_own_order_except_when_overfitting(trainings: Path) -> None:
-    rows = history(trainings / "mid-epoch" / "whole", "train")
+def test_every_epoch_has_its_own_order_except_when_overfitting(trainings: Trainings) -> None:
+    rows = history(trainings("mid-epoch") / "whole", "train")
     epochs = [[row[3] for row in rows if row[0] == epoch] for epoch in range(3)]
     assert all(len(set(chain(*epoch))) == 160 for epoch in epochs)
     assert epochs[0] != epochs[1] != epochs[2]
-    rows = history(trainings / "overfitting" / "whole", "train")
+    rows = history(trainings("overfitting") / "whole", "train")
     epochs = [[row[3] for row in rows if row[0] == epoch] for epoch in range(3)]
     assert epochs[0] == epochs[1] == epochs[2]
     assert len(epochs[0]) == 3
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), sys.argv[2:])

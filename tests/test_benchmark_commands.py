@@ -1,5 +1,6 @@
 """Stopped benchmarks, which stop their commands and wait until these have ended."""
 
+import itertools
 import signal
 import subprocess
 import sys
@@ -8,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.commands import ROOT, carry_out
+from tests.conftest import first_of_each
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CHILD = """
@@ -30,8 +32,14 @@ carry_out([sys.executable, "-c", sys.argv[1]])
 """
 
 
-@pytest.mark.parametrize("number", NUMBERS, ids=lambda number: number.name)
-@pytest.mark.parametrize("whole_group", [False, True], ids=["one process", "as from a terminal"])
+@pytest.mark.parametrize(
+    ("number", "whole_group"),
+    first_of_each(
+        itertools.product(NUMBERS, (False, True)),
+        lambda case: case[1],
+        lambda case: f"{case[0].name} {'as from a terminal' if case[1] else 'to one process'}",
+    ),
+)
 def test_what_it_runs_is_told_once_and_waited_for(number: signal.Signals, whole_group: bool) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", BENCHMARK, CHILD], cwd=ROOT, stdout=subprocess.PIPE, text=True, process_group=0

@@ -33,7 +33,7 @@ from framework.configuration.settings import (
 )
 from framework.errors import ConfigError
 from framework.storage import cache
-from tests.conftest import Framework
+from tests.conftest import Framework, first_of_each
 
 EXPERIMENTS = sorted(
     str(path.relative_to(folder() / "experiment").with_suffix(""))
@@ -63,9 +63,9 @@ def test_every_experiment_composes_and_its_plugins_accept_it(name: str) -> None:
 
 
 SMOKE_RUNS = {
+    "caviar": "caviar/fixed_kappa",
     "idiap": "idiap/von_mises",
     "towncentre": "towncentre/von_mises",
-    "caviar": "caviar/fixed_kappa",
     "cest": "cest/refined",
     "moons": "moons/vanilla_128",
     "modelnet40": "modelnet40/bps_extra_trees",
@@ -85,7 +85,10 @@ NOT_RUN = {
 flights no preset gives the thesis's setting."""
 
 
-@pytest.mark.parametrize("data", SMOKE_RUNS)
+@pytest.mark.parametrize(
+    "data",
+    first_of_each(SMOKE_RUNS, lambda data: "heads" if data in ("caviar", "idiap", "towncentre") else data),
+)
 def test_a_smoke_run_goes_through_every_stage(data: str, framework: Framework) -> None:
     """Train with the thesis preset; settings that the preset does not contain come from the experiment."""
     run = ("preset=thesis", "debug=fast", "logger=none", "pictures=false", "samples=50", "threads=1")
@@ -126,12 +129,21 @@ def test_an_experiment_of_each_family_can_be_shortened(name: str) -> None:
         assert 1 <= trainer["check_val_every_n_epoch"] <= epochs
 
 
+SHORTER = {
+    "modelnet40/": "batch_size=4",
+    "modelnet40/bps_conv3d_ensemble": "uncertainty.ensemble.members=2",
+    "rasterizer/fit_pose": "density_head.steps=3",
+}
+"""Further settings by the beginning of the experiment's name, without which a run takes up to a minute."""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHORTENED)
 def test_every_experiment_runs_shortened(name: str, framework: Framework) -> None:
     """Run with the cache that all tests share, since generating bodies takes minutes."""
     done = framework(
         *(f"experiment={name}", "debug=fast", "logger=none", "pictures=false", "threads=1", "samples=20"),
+        *(setting for start, setting in SHORTER.items() if name.startswith(start)),
         more={"FRAMEWORK_CACHE": str(cache.folder(""))},
     )
     wanted = [said for start, said in REFUSED.items() if name.startswith(start)]

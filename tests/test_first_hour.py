@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 COMMANDS = """
 import sys
@@ -26,6 +27,7 @@ def written(figure: Path) -> str:
     return " ".join(re.findall("<!-- (.*?) -->", figure.read_text(encoding="utf-8"), re.S))
 
 
+@pytest.mark.slow
 def test_own_data_are_named_and_long_work_says_how_far_it_is(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     lines = ["width,height,gaze,group"]

@@ -138,6 +138,7 @@ def test_a_run_is_closed_whatever_becomes_of_its_process(how: str, tmp_path: Pat
     assert [line.get("status") for line in lines] == [None] if how == "closes" else [None, "KILLED"]
 
 
+@pytest.mark.slow
 def test_a_killed_script_leaves_nothing_of_its_sweep(tmp_path: Path) -> None:
     """Even a job that ignores the request to end leaves no process."""
     app = App(tmp_path, fork=True)

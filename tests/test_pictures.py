@@ -530,9 +530,15 @@ def test_odd_comparisons_are_drawn(rows: list[dict], tmp_path: Path) -> None:
     drawn(diagram(rows), tmp_path)
 
 
-@pytest.mark.parametrize("panels", [1, 2, 4])
-@pytest.mark.parametrize("times", [(1.19,), (1.19, 1.19), (1e-5, 1e6)])
-@pytest.mark.parametrize("error", [3.0, 0.0, -5.0, 1e-300])
+@pytest.mark.parametrize(
+    ("panels", "times", "error"),
+    [
+        *((1, times, error) for times in [(1.19,), (1.19, 1.19), (1e-5, 1e6)] for error in [3.0, 0.0, -5.0]),
+        (1, (1.19,), 1e-300),
+        (2, (1.19, 1.19), -5.0),
+        (4, (1e-5, 1e6), 0.0),
+    ],
+)
 def test_a_result_alone_stands_in_the_middle_of_its_panels(
     panels: int, times: tuple[float, ...], error: float, tmp_path: Path
 ) -> None:

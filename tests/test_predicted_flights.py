@@ -4,10 +4,13 @@ file."""
 import csv
 from pathlib import Path
 
+import pytest
+
 from plugins.data.table_tennis.rows import table, write_csv
 from tests.conftest import Framework
 
 
+@pytest.mark.slow  # a solver is compiled and fits 12 flights
 def test_a_folder_of_flights_becomes_positions_with_intervals(framework: Framework, tmp_path: Path) -> None:
     short = ("data.future=5", "data.flights=12", "data.stride=20", "density_head.identify=false", "metric=[]")
     made = framework(

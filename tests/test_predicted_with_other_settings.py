@@ -63,7 +63,9 @@ def images(folder: Path) -> tuple[list[str], Path, dict[str, str | None]]:
     )
 
 
-@pytest.mark.parametrize("kind", [table, images], ids=["table", "images"])
+@pytest.mark.parametrize(
+    "kind", [pytest.param(table, id="table"), pytest.param(images, id="images", marks=pytest.mark.slow)]
+)
 def test_a_setting_of_the_data_changes_what_is_read_or_is_refused(
     kind: object, framework: Framework, tmp_path: Path
 ) -> None:

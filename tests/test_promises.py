@@ -38,9 +38,9 @@ ELSEWHERE = {"refined"}
 """Wrappers that only fit the models of one data set: least squares for Z-spectra."""
 ONLY = {"platt": ("class",)}
 OFTEN = {
-    "conformal": ("degrees",),
+    "conformal": ("several reals",),
     "temperature": ("real",),
-    "mc_dropout": ("several reals",),
+    "mc_dropout": ("degrees",),
     "ensemble": ("class",),
     "platt": ("class",),
 }

@@ -292,6 +292,8 @@ class Search:
 
 def test_a_search_ranks_its_trials_and_goes_on_where_it_was(tmp_path: Path) -> None:
     search = Search(tmp_path)
+    unchecked = "from framework.sweeps import rehearsal\nrehearsal.COMMAND = [sys.executable, '-c', '']\n"
+    (tmp_path / "app.py").write_text(APP.replace("from framework.app", unchecked + "from framework.app"))
     arguments = ["experiment=pascal3d/scvae", "logger=none", "data.category=car", *SPACE]
     code, output = search(*arguments, "hydra.sweeper.trials=8")
     assert code == 1, output
@@ -494,6 +496,7 @@ def test_bad_input_gets_a_sentence_and_runs_nothing(
     assert not search.jobs()
 
 
+@pytest.mark.slow
 def test_the_best_of_a_real_search_can_be_run_and_repeats_its_trial(
     framework: Framework, tmp_path: Path
 ) -> None:

@@ -323,6 +323,7 @@ def test_a_family_of_repositories_may_be_listed(tmp_path: Path, monkeypatch: pyt
         assert bool(git_commit(folder)) is read
 
 
+@pytest.mark.slow  # four runs, and three processes that import MLflow
 def test_whoever_asks_git_asks_it_of_no_strangers_folder(
     framework: Framework, tmp_path: Path, stranger_site: Path
 ) -> None:

@@ -196,6 +196,7 @@ def test_every_form_is_answered_as_in_a_notebook(servers: dict[str, Server]) -> 
             pd.testing.assert_frame_equal(found, wanted, rtol=1e-6, check_dtype=False)
 
 
+@pytest.mark.slow
 def test_made_up_samples_are_answered_before_the_server_listens(servers: dict[str, Server]) -> None:
     """Each kind of model predicts its own sample request, so that the first request needs no imports and no
     compilation."""
@@ -301,6 +302,7 @@ def faults(row: dict[str, Any]) -> Iterator[tuple[str, bytes | str, str | None]]
         yield f"{name}, CSV", body, CSV
 
 
+@pytest.mark.slow
 def test_no_form_with_any_fault_gets_more_than_a_sentence(servers: dict[str, Server]) -> None:
     """Any faulty body gets the status 400, 413 or 415 within 5 s and with less than 1 GB of additional memory."""
     for kind, row in ((TABULAR, ROW), (IMAGES, {"base64": text(png()), "name": "my.png"})):
@@ -318,6 +320,7 @@ def test_no_form_with_any_fault_gets_more_than_a_sentence(servers: dict[str, Ser
         assert server.post(*forms([row])["dataframe_split"])[0] == 200
 
 
+@pytest.mark.slow
 def test_contents_of_files_are_bounded_and_named_by_row(servers: dict[str, Server]) -> None:
     """The message contains the client's name of the file, not the server's; no file of the server is read."""
     server = servers[IMAGES]
@@ -360,6 +363,7 @@ def test_contents_of_files_are_bounded_and_named_by_row(servers: dict[str, Serve
     assert not left, "a request leaves nothing behind"
 
 
+@pytest.mark.slow
 def test_the_bound_of_size_and_time_holds_before_a_body_is_there(servers: dict[str, Server]) -> None:
     """Send a Content-Length that is too large, false or missing, and bodies that are endless or slow."""
     server = servers[TABULAR]

@@ -42,8 +42,8 @@ def test_asking_imports_nothing_heavy_and_no_plugin(arguments: tuple[str, ...], 
     [
         ("moons/vanilla_128", "density_head=scvae"),
         ("moons/vanilla_128", "trainer.strategy=dpp"),
-        ("moons/vanilla_128", "encoder.mlp.widths=[0]"),
-        ("pascal3d/scvae", "density_head=categorical"),
+        pytest.param("moons/vanilla_128", "encoder.mlp.widths=[0]", marks=pytest.mark.slow),
+        pytest.param("pascal3d/scvae", "density_head=categorical", marks=pytest.mark.slow),
     ],
 )
 def test_a_mistake_is_found_before_what_trains_is_imported(

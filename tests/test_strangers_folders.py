@@ -169,6 +169,7 @@ OFTEN: dict[Callable[[Sent], None], str] = {}
 for number, attack in enumerate(dict.fromkeys(attack for attack, _ in CASES)):
     names = [name for case, name in CASES if case is attack]
     OFTEN[attack] = names[number % len(names)]
+OFTEN[database] = "resume"  # a sweep waits 16 s for the database
 """One command of each attack, in turn; the others are slow tests."""
 SURVIVED = {("results_of_two_names", name) for name in ("test", "predict", "train from it")} | {
     (attack, name)

@@ -374,6 +374,7 @@ for line in json.load(sys.stdin):
 """
 
 
+@pytest.mark.slow
 def test_training_test_and_prediction_run_with_every_kind_of_target(tmp_path: Path) -> None:
     file = table(tmp_path, rows=90)
     (tmp_path / "new.csv").write_text("square,number\n25,5\n")

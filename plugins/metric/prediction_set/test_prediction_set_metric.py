@@ -35,7 +35,11 @@ def evaluate(target, density, threshold, labels, score="density", **fields):
     return {name: value.item() for name, value in actual.compute().items()}
 
 
-@pytest.mark.parametrize("target", [CLASSES, ANGLE, REAL], ids=lambda target: target.kind)
+@pytest.mark.parametrize(
+    "target",
+    [CLASSES, *(pytest.param(target, marks=pytest.mark.slow) for target in (ANGLE, REAL))],
+    ids=lambda target: target.kind,
+)
 def test_the_contract_tests_pass_on_sets(target, monkeypatch):
     """Check sets of level 1.7 nats for every density, so that sizes differ between densities."""
     plain = metrics.simplest_density
