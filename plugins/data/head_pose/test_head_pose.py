@@ -239,7 +239,11 @@ def test_the_message_about_damaged_generated_data_says_to_delete_them(cache: Pat
 
 @pytest.mark.parametrize(
     ("name", "images", "correlation"),
-    [("idiap", 600, 0.4), ("towncentre", 1200, 0.4), ("caviar", 1200, 0.25)],
+    [
+        ("caviar", 1200, 0.25),
+        pytest.param("idiap", 600, 0.4, marks=pytest.mark.slow),
+        pytest.param("towncentre", 1200, 0.4, marks=pytest.mark.slow),
+    ],
 )
 def test_images_agree_with_their_labels(name: str, images: int, correlation: float) -> None:
     """Check that a kernel regression predicts the sine of the first angle from coarse grey images.

@@ -112,6 +112,7 @@ def test_of_normals_it_is_the_ratio_of_variances(spread, wanted):
     assert exact == pytest.approx(wanted, rel=0.1)
 
 
+@pytest.mark.slow
 def test_of_any_angle_and_of_a_mixture():
     """Check that a cardioid of power 3 equals a cardioid at T = 1/3, also as members of a mixture."""
     generator = torch.Generator().manual_seed(2)
