@@ -237,7 +237,9 @@ def test_on_a_part_of_the_circle_with_a_logarithm_at_its_ends() -> None:
         assert density.entropy().tolist() == pytest.approx([1.0, 1.0], abs=1e-9)
 
 
-@pytest.mark.parametrize("kind", [VonMises, Normal], ids=["angle", "real"])
+@pytest.mark.parametrize(
+    "kind", [pytest.param(VonMises, id="angle", marks=pytest.mark.slow), pytest.param(Normal, id="real")]
+)
 def test_of_more_peaks_than_can_be_compared_draws_tell_it(
     kind: type, caplog: pytest.LogCaptureFixture
 ) -> None:

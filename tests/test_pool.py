@@ -331,7 +331,7 @@ def test_what_a_job_is_told(app: App, monkeypatch: pytest.MonkeyPatch) -> None:
     assert own == [True, "", str(app.folder), app.record(3)["command"][-len(own[3]) :], "__main__"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_a_signal_lets_the_jobs_close_and_the_sweep_be_resumed(number: signal.Signals, app: App) -> None:
     arguments = ["what=hold", "x=0,1,2", "hydra.launcher.jobs=2"]
     process = app.start("-m", "hydra/launcher=pool", *arguments)
@@ -509,7 +509,12 @@ def test_a_job_composes_the_config_the_sweep_composed(app: App) -> None:
 
 
 @pytest.mark.parametrize(
-    "sweeps", [["x=0", "x=1"], ["x=0,1", "x=1,2", "x=3"], ["x=0,1", "x=0,1"], ["x=5,5", "x=5", "x=6,5"]]
+    "sweeps",
+    [
+        ["x=0,1", "x=1,2", "x=3"],
+        ["x=5,5", "x=5", "x=6,5"],
+        *(pytest.param(sweeps, marks=pytest.mark.slow) for sweeps in (["x=0", "x=1"], ["x=0,1", "x=0,1"])),
+    ],
 )
 def test_sweeps_that_begin_at_once_in_one_folder_keep_their_jobs_apart(app: App, sweeps: list[str]) -> None:
     app.environment["MEET"] = str(len(sweeps))

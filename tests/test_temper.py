@@ -384,7 +384,9 @@ def test_of_classes_every_mixture_is_tempered_as_a_whole_and_none_changes_its_li
         assert (estimate(found, found.mode).standard_error > 0) == isinstance(density, SampledMixture)
 
 
-@pytest.mark.parametrize("kelvin", [0.2, 1.0, 3.0])
+@pytest.mark.parametrize(
+    "kelvin", [0.2, *(pytest.param(kelvin, marks=pytest.mark.slow) for kelvin in (1.0, 3.0))]
+)
 @pytest.mark.parametrize("name", ["scvae", "cvae"])
 @pytest.mark.parametrize("more", [{}, {"tolerance": 0.1}], ids=["samples", "tolerance"])
 def test_of_classes_latent_densities_keep_their_likeliest(name, kelvin, more):

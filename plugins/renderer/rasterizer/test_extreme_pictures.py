@@ -153,6 +153,7 @@ def test_a_vertex_on_the_plane_of_the_camera_hides_no_part_of_its_face(depth: fl
     assert torch.allclose(channels, true, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_nearest_of_a_million_faces_in_one_pixel_is_visible() -> None:
     random = np.random.default_rng(0)
     depth = random.permutation(np.linspace(1, 2, 1_000_000))
