@@ -72,11 +72,9 @@ def trained(framework: Framework, *more: str, folder: str) -> Done:
     return done
 
 
-@pytest.mark.parametrize(
-    "objectives",
-    [pytest.param((), id="likelihood", marks=pytest.mark.slow), pytest.param(RIVALS, id="rivals")],
-)
-@pytest.mark.parametrize("at", [pytest.param(2, marks=pytest.mark.slow), 7])
+@pytest.mark.slow
+@pytest.mark.parametrize("objectives", [(), RIVALS], ids=["likelihood", "rivals"])
+@pytest.mark.parametrize("at", [2, 7])
 def test_a_killed_run_goes_on_bit_by_bit(
     framework: Framework, tmp_path: Path, objectives: tuple[str, ...], at: int
 ) -> None:

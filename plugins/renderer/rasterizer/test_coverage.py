@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import NamedTuple, no_type_check
 
 import numpy as np
+import pytest
 import torch
 from numba import njit
 from scipy.spatial import Delaunay
@@ -198,6 +199,7 @@ def sum_counts(counts: Iterable[tuple[str, PixelCounts]]) -> PixelCounts:
     return PixelCounts(*np.sum([camera_points for _, camera_points in counts], 0).tolist())
 
 
+@pytest.mark.slow
 def test_every_pixel_of_a_tessellated_plane_is_covered_once_whatever_the_camera() -> None:
     """Check 2,000 cameras; benchmarks/rendering/rasterizer_coverage.py has 10,000."""
     camera_points = sum_counts(views(2000))
