@@ -378,6 +378,32 @@ def load(typing, array, start):
 
 @intrinsic
 @no_type_check
+def gather(typing, array, indices, truth):
+    """Return the elements of an array at the int64 `indices` in lanes where `truth` is true, and 0 in other lanes."""
+    result = Lanes(array.dtype)
+
+    def generate(context, builder, sig, values):
+        element, vector = (context.get_value_type(kind) for kind in (array.dtype, result))
+        data = context.make_array(sig.args[0])(context, builder, values[0]).data
+        size = ir.Constant(ir.IntType(64), array.dtype.bitwidth // 8)
+        wide = ir.VectorType(ir.IntType(64), LANES)
+        steps = builder.mul(values[1], ir.Constant(wide, [size.constant] * LANES))
+        start = builder.ptrtoint(data, ir.IntType(64))
+        same = builder.insert_element(ir.Constant(wide, ir.Undefined), start, ir.Constant(INT32, 0))
+        starts = builder.shuffle_vector(same, same, places([0] * LANES))
+        pointers = builder.inttoptr(builder.add(starts, steps), ir.VectorType(element.as_pointer(), LANES))
+        arguments = [pointers.type, INT32, ir.VectorType(ir.IntType(1), LANES), vector]
+        kind = f"f{array.dtype.bitwidth}" if real(array.dtype) else f"i{array.dtype.bitwidth}"
+        name = f"llvm.masked.gather.v{LANES}{kind}.v{LANES}p0"
+        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(vector, arguments), name)
+        align = ir.Constant(INT32, array.dtype.bitwidth // 8)
+        return builder.call(function, [pointers, align, values[2], ir.Constant(vector, None)])
+
+    return result(array, indices, truth), generate
+
+
+@intrinsic
+@no_type_check
 def load4(typing, array, start):
     """Return a vector of 4 consecutive elements of an array, from index `start` on."""
     return loaded(array, 1, 1, 4)

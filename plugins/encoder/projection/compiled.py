@@ -13,11 +13,14 @@ from typing import no_type_check
 
 import numpy as np
 
+from framework.geometry.nearest import lanes
+from framework.geometry.nearest.lanes import LANES, gather, load, mask, store, where
+from framework.geometry.nearest.lanes import splat as spread
 from framework.storage.kernels import compiler, kernel_cache
 
 KERNELS = ("compiled",)
 """Names of the files with compiled functions that call each other."""
-compiled = compiler(kernel_cache("projection", [Path(__file__)]))
+compiled = compiler(kernel_cache("projection", [Path(__file__), Path(lanes.__file__)]))
 
 
 @compiled
@@ -137,30 +140,35 @@ def splat(image, nearest, span, focal, thick, around, close, weights, filled):
     if count == 0:
         return
     # The rest of the function runs on the bounding box of the points, widened by a border. The border contains the
-    # discs around the points and the pixels beside the `near` pixels.
+    # discs around the points and the pixels beside the `near` pixels. The rows of a disc are vectors of 16 pixels, of
+    # which those beyond the disc are left out. The vectors may end beyond the box, so that a row has `line` pixels.
     top, left = pixels[0, 0] - border, least - border
     box = (pixels[count - 1, 0] + border + 1 - top, most + border + 1 - left)
-    square_of_offset, factor = np.empty(len(around), np.uint64), np.empty(len(around))
+    line = box[1] + LANES
+    side = 2 * radius + 1
+    vectors = (side + LANES - 1) // LANES
+    square_of_offset = np.full(side * vectors * LANES, longest, np.int64)
+    factor = np.full(side * vectors * LANES, np.inf)
+    inside = np.zeros(side * vectors, np.int64)
     for number in range(len(around)):
-        square_of_offset[number] = around[number, 0] ** 2 + around[number, 1] ** 2
-        factor[number] = 1 + np.float64(square_of_offset[number]) ** 0.5 / focal
-    first = np.full(box, np.inf)
-    square = np.full(box, longest, np.uint64)
+        place = (around[number, 0] + radius) * vectors * LANES + around[number, 1] + radius
+        square_of_offset[place] = around[number, 0] ** 2 + around[number, 1] ** 2
+        factor[place] = 1 + np.float64(square_of_offset[place]) ** 0.5 / focal
+        inside[place // LANES] |= 1 << (place % LANES)
+    first = np.full(box[0] * line, np.inf)
+    square = np.full(box[0] * line, longest, np.int64)
     near = np.zeros(box, np.bool_)
     for point in range(count):
         row, column = pixels[point]
-        depth = nearest + span * np.float64(image[3, row, column])
+        depth = spread(nearest + span * np.float64(image[3, row, column]))
         row, column = row - top, column - left
-        for number in range(len(around)):
-            # unsigned indices avoid the check for negative indices, which count from the end
-            down, across = np.uint64(row + around[number, 0]), np.uint64(column + around[number, 1])
-            cone = depth * factor[number]
-            nearest_cone = first[down, across]
-            if cone <= nearest_cone and (
-                cone < nearest_cone or square_of_offset[number] < square[down, across]
-            ):
-                first[down, across] = cone
-                square[down, across] = square_of_offset[number]
+        for number in range(side * vectors):
+            at = (row + number // vectors - radius) * line + column - radius + number % vectors * LANES
+            cone, nearest_cone = depth * load(factor, LANES * number), load(first, at)
+            squared, smallest = load(square_of_offset, LANES * number), load(square, at)
+            ahead = (cone < nearest_cone) | ((cone == nearest_cone) & (squared < smallest))
+            store(first, at, where(ahead, cone, nearest_cone))
+            store(square, at, where(ahead, squared, smallest))
         for number in range(len(close)):
             near[row + close[number, 0], column + close[number, 1]] = True
     # Erosion: each pixel of the image that is not `near` removes the disc around itself. Only pixels beside a `near`
@@ -180,30 +188,42 @@ def splat(image, nearest, span, focal, thick, around, close, weights, filled):
                     down, across = row + close[number, 0], column + close[number, 1]
                     if 0 <= down < box[0] and 0 <= across < box[1]:
                         outside[down, across] = True
-    behind = np.where(near & ~outside, first * (1 + thick / focal), -np.inf)
-    total = np.zeros((*box, 5))
+    behind = np.full(box[0] * line, -np.inf)
+    for row in range(box[0]):
+        for column in range(box[1]):
+            if near[row, column] and not outside[row, column]:
+                behind[row * line + column] = first[row * line + column] * (1 + thick / focal)
+    table, length = weights.reshape(-1), spread(longest)
+    sums = np.zeros((5, box[0] * line))
+    red, green, blue, far, mass = sums[0], sums[1], sums[2], sums[3], sums[4]
     for point in range(count):
         row, column = pixels[point]
-        red, green = np.float64(image[0, row, column]), np.float64(image[1, row, column])
-        blue, far = np.float64(image[2, row, column]), np.float64(image[3, row, column])
-        depth = nearest + span * far
+        depth = np.float64(image[3, row, column])
+        colors = (
+            spread(np.float64(image[0, row, column])),
+            spread(np.float64(image[1, row, column])),
+            spread(np.float64(image[2, row, column])),
+            spread(depth),
+        )
+        depth = spread(nearest + span * depth)
         row, column = row - top, column - left
-        for number in range(len(around)):
-            down, across = np.uint64(row + around[number, 0]), np.uint64(column + around[number, 1])
-            if depth < behind[down, across]:
-                weight = weights[square_of_offset[number], square[down, across]]
-                sums = total[down, across]
-                sums[0] += weight * red
-                sums[1] += weight * green
-                sums[2] += weight * blue
-                sums[3] += weight * far
-                sums[4] += weight
+        for number in range(side * vectors):
+            at = (row + number // vectors - radius) * line + column - radius + number % vectors * LANES
+            shown = (depth < load(behind, at)) & mask(inside[number])
+            index = load(square_of_offset, LANES * number) * length + load(square, at)
+            weight = gather(table, index, shown)
+            store(red, at, load(red, at) + weight * colors[0])
+            store(green, at, load(green, at) + weight * colors[1])
+            store(blue, at, load(blue, at) + weight * colors[2])
+            store(far, at, load(far, at) + weight * colors[3])
+            store(mass, at, load(mass, at) + weight)
     for row in range(low, high):
         for column in range(start, stop):
-            if square[row, column] < longest:
-                distance = np.float64(square[row, column]) ** 0.5
-                filled[4, row + top, column + left] = distance / (radius + 1)
-            if behind[row, column] > 0:
-                for channel in range(4):
-                    mean = total[row, column, channel] / total[row, column, 4]
-                    filled[channel, row + top, column + left] = mean
+            at = row * line + column
+            if square[at] < longest:
+                filled[4, row + top, column + left] = np.float64(square[at]) ** 0.5 / (radius + 1)
+            if behind[at] > 0:
+                filled[0, row + top, column + left] = red[at] / mass[at]
+                filled[1, row + top, column + left] = green[at] / mass[at]
+                filled[2, row + top, column + left] = blue[at] / mass[at]
+                filled[3, row + top, column + left] = far[at] / mass[at]
