@@ -75,7 +75,13 @@ class Layer(nn.Module):
         ground = shift.relu()
         weight = (self.weight * scale[:, None, None, None]).to(dtype, memory_format=torch.channels_last)
         bias, floor = (shift - ground).to(dtype), -ground.to(dtype)[:, None, None]
-        return lambda maps: torch.maximum(convolve(maps, weight, bias, self.stride), floor)
+
+        def evaluate(maps: Tensor) -> Tensor:
+            raw = convolve(maps, weight, bias, self.stride)
+            # in place where nothing needs the gradient, because new memory takes as long as the maximum
+            return torch.maximum(raw, floor, out=None if raw.requires_grad else raw)
+
+        return evaluate
 
     def _normalise(self, maps: Tensor) -> Tensor:
         if self.normalisation != "group":

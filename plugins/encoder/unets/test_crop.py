@@ -78,16 +78,16 @@ def test_training_computes_everything_and_says_so():
 
 
 def test_what_is_not_finite_is_not_empty():
-    image = torch.zeros(2, 9, 9)
+    image = torch.ones(2, 9, 9)
     image[0, 3, 5] = torch.nan
     image[1, 4, 5] = -torch.inf
     assert subject_box(image, 1, 0) == Box(3, 5, 5, 6)
-    assert subject_box(torch.zeros(2, 9, 9), 1, 3) is None
+    assert subject_box(torch.ones(2, 9, 9), 1, 3) is None
 
 
 def test_margin_and_stride_keep_to_the_frame():
-    image = torch.zeros(1, 10, 10)
-    image[0, 9, 0] = 1
+    image = torch.ones(1, 10, 10)
+    image[0, 9, 0] = 0
     assert subject_box(image, 4, 1) == Box(8, 12, 0, 4)
     assert subject_box(image, 4, 100) == Box(0, 12, 0, 12)
     assert Canvas(3, 4, 1, "float32").shuffle == 1
