@@ -22,6 +22,8 @@ COLUMNS = (*XYZ, *COLOURS)
 """First columns of the points on which the network must have been trained."""
 SIZES_KEPT = 4
 """Number of image sizes whose networks are kept in memory."""
+LARGEST_CHANGE, MEAN_CHANGE = 4 / 255, 0.05 / 255
+"""Largest and mean difference between sRGB colours by bfloat16 and by float32 that `precision="auto"` accepts."""
 
 
 class SMPLpix(Renderer):
@@ -40,7 +42,10 @@ class SMPLpix(Renderer):
         checkpoint: folder of a run, its model.ckpt, or an MLflow run id.
         paths: files and folders that the run's configuration names. A path that is stored in the checkpoint is used
             only if it is repeated here, as in `renderer.paths={encoder: {rasterised: {body: ...}}}`.
-        precision: number type of evaluation, as in `encoder=unet`; "trained" for the run's setting.
+        precision: number type of evaluation. "auto" computes in bfloat16 if the processor computes it faster than
+            float32 and if colours of a test image then differ from those by float32 by at most `LARGEST_CHANGE`, and
+            by at most `MEAN_CHANGE` on average; otherwise in float32. "trained" is the run's setting, which gives the
+            same bits as the run's own predictions.
         crop: margin in pixels; the image is computed only in the subject's bounding box plus this margin. "whole"
             computes the whole image; "trained" uses the run's setting.
 
@@ -58,7 +63,7 @@ class SMPLpix(Renderer):
         *,
         checkpoint: FilePath | None = None,
         paths: dict[str, Any] | None = None,
-        precision: Literal["trained", "auto", "float32", "bfloat16"] = "trained",
+        precision: Literal["trained", "auto", "float32", "bfloat16"] = "auto",
         crop: Annotated[int, Field(ge=0)] | Literal["trained", "whole"] = "trained",
     ) -> None:
         if checkpoint is None:
@@ -76,11 +81,15 @@ class SMPLpix(Renderer):
             )
         self.size = target.size
         for part in self.description.config["encoder"]:
-            if precision != "trained" and "precision" in part:
-                part["precision"] = precision
             if crop != "trained" and "crop" in part:
                 part["crop"] = None if crop == "whole" else crop
         self._predictors: dict[tuple[int, int], Predictor] = {}
+        if precision == "auto":
+            exact, fast = self._test_image("float32"), self._test_image("auto")
+            change = (fast - exact).abs()
+            if not (change.max() <= LARGEST_CHANGE and change.mean() <= MEAN_CHANGE):
+                precision = "float32"
+        self._set_precision(precision)
         self._predictor(*self.size)
 
     @torch.no_grad()
@@ -95,6 +104,32 @@ class SMPLpix(Renderer):
         except DataError as error:
             raise ValueError(f"the network cannot draw this scene: {error}") from error
         return {"color": image.float().to(scene.vertices.device)}
+
+    def _set_precision(self, precision: str) -> None:
+        """Set the number type of evaluation of all encoders that have this setting; "trained" changes nothing."""
+        for part in self.description.config["encoder"]:
+            if precision != "trained" and part.get("precision", precision) != precision:
+                part["precision"] = precision
+                self._predictors.clear()
+
+    @torch.no_grad()
+    def _test_image(self, precision: str) -> Tensor:
+        """Return the image of a small coloured sphere, sRGB, with evaluation in this precision."""
+        self._set_precision(precision)
+        encoders = self.description.config["encoder"]
+        near, far = next(
+            ((part["nearest"], part["farthest"]) for part in encoders if "nearest" in part), (1.0, 5.0)
+        )
+        count = int(self.description.input_shape[0])
+        # a spiral of points at equal distances (Vogel 1979)
+        height = torch.linspace(-1, 1, count)
+        angle = torch.arange(count) * (torch.pi * (3 - 5**0.5))
+        around = (1 - height.square()).sqrt()
+        sphere = torch.stack([around * angle.cos(), height, around * angle.sin()], 1)
+        position = torch.tensor([0.0, 0.0, (near + far) / 2]) + 0.05 * (near + far) * sphere
+        points = torch.cat([position, 0.5 + 0.5 * sphere], 1)
+        density = self._predictor(*self.size)(points[None])
+        return srgb_from_linear(images(density, ("color",))["color"][0])
 
     def _predictor(self, height: int, width: int) -> Predictor:
         """Return the network for images of a size; all sizes share the same weights."""

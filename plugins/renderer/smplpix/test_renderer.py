@@ -11,6 +11,7 @@ from framework.geometry.camera import canonical_camera, look_from
 from framework.geometry.srgb import linear_from_srgb, srgb_from_linear
 from framework.renderer import Scene
 from framework.testing.scenes import sphere
+from plugins.renderer.smplpix.renderer import LARGEST_CHANGE
 from plugins.renderer.smplpix.rows import NEAR, SLIM, UNET, projection_settings, write_checkpoint
 
 SIZE, OTHER = (40, 32), (27, 50)
@@ -26,7 +27,8 @@ ENCODERS = {
 
 
 def renderer(run, **config):
-    return build("renderer", resolve("renderer", {"name": "smplpix", "checkpoint": str(run), **config}))
+    settings = {"name": "smplpix", "checkpoint": str(run), "precision": "trained", **config}
+    return build("renderer", resolve("renderer", settings))
 
 
 def own_paths(encoders):
@@ -136,6 +138,20 @@ def test_the_box_and_the_precision_can_be_chosen(tmp_path):
     assert torch.equal(pictures[0], pictures[1])
     for other in pictures[2:]:
         assert 0 < (other - pictures[0]).abs().max() < 0.5
+
+
+@pytest.mark.parametrize("accepted", [LARGEST_CHANGE, 0.0])
+def test_bfloat16_is_the_default_only_where_it_is_accurate(accepted, encoders, tmp_path, monkeypatch):
+    monkeypatch.setattr("plugins.renderer.smplpix.renderer.LARGEST_CHANGE", accepted)
+    run = write_checkpoint(tmp_path / "run.ckpt", encoders, SIZE, len(MESH.vertices))
+    scene = replace(MESH, camera=distant_camera(SIZE))
+    automatic, exact, fast = (
+        renderer(run, paths=own_paths(encoders), precision=precision)(scene)["color"]
+        for precision in ("auto", "float32", "bfloat16")
+    )
+    assert not torch.equal(exact, fast)
+    has_bfloat16 = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+    assert torch.equal(automatic, fast if has_bfloat16 and accepted > 0 else exact)
 
 
 @pytest.mark.parametrize("run, kind, message", [
