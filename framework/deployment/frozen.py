@@ -2,8 +2,8 @@
 
 The computation from features to raw parameters is read from the model's graph (torch.export), so no encoder has to
 declare its layers. If the graph contains fully connected layers only, batch norm is folded into the weights of the
-neighbouring layers, dropout is removed, and NumPy and one compiled function compute the raw parameters on one CPU core.
-Any other model is run by torch unchanged, without gradients.
+neighbouring layers, and dropout is removed. One compiled function then computes the raw parameters of one sample, and
+torch's matrix products those of more. Any other model is run by torch unchanged, without gradients.
 """
 
 import copy
@@ -19,7 +19,7 @@ from torch.distributions import Distribution
 
 from framework.configuration.loading import load_with_description, reader, user_batch
 from framework.data import Data, Frame
-from framework.deployment.frozen_network import Layer, Network, read_network, softmax
+from framework.deployment.frozen_network import Layer, Network, read_network, to_probabilities
 from framework.distributions.affine import AffineDensity
 from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.description import CategoricalDensity
@@ -109,9 +109,8 @@ class Frozen:
         """
         features, network, frame = self._features(inputs)
         if network is not None and network.classes:
-            probability = network(features)
-            softmax(probability)
-            if np.isnan(probability[:, 0]).any():
+            probability, all_finite = to_probabilities(network(features))
+            if not all_finite:
                 row = int(np.isnan(probability[:, 0]).argmax())
                 raise ValueError(
                     f"The raw parameters are not finite in batch row {row}. Check the inputs of this row."

@@ -1,10 +1,11 @@
-"""Fully connected layers, read from the graph of a model and computed by NumPy and compiled functions.
+"""Fully connected layers, read from the graph of a model and computed by a compiled function or by torch.
 
 The tests enable type checks that wrap every function; `no_type_check` excludes functions that must be compiled.
 """
 
 import copy
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from framework.storage.kernels import compiler, kernel_cache
 
 LEAVES = (nn.Linear, nn.BatchNorm1d, nn.ReLU, nn.Dropout, nn.Flatten, nn.Identity, nn.Sequential)
 """Layers that a network may have; a model with other layers is not exported: the export would take long and fail."""
+FEW = 8  # largest batch for which the compiled softmax is faster than torch's
 MOST_RAW = 2048  # largest number of raw parameters of a head that is tested for a softmax
 
 
@@ -30,28 +32,27 @@ MOST_RAW = 2048  # largest number of raw parameters of a head that is tested for
 class Layer:
     """Step of a `Network` that computes a fully connected layer: registers[source] @ weight + bias.
 
-    `weight` has the shape (inputs, outputs). If `rectified` is True, negative outputs are set to 0.
+    `weight` has the shape (inputs, outputs). If `rectified` is True, negative outputs are set to 0. `tensors` are
+    weight and bias as tensors, which `Network.cast` sets.
     """
 
     source: int
     weight: np.ndarray
     bias: np.ndarray
     rectified: bool = False
+    tensors: tuple[Tensor, Tensor] | None = None
 
-    def __call__(self, registers: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the outputs of the layer, (batch, outputs)."""
-        numbers = registers[self.source]
-        if len(numbers) == 1:
-            result = np.empty((1, len(self.bias)), self.bias.dtype)
-            compute_layer(numbers[0], self.weight, self.bias, self.rectified, result[0])
-            return result
-        # For two or more samples NumPy is faster, because it reads the weights once (benchmarks/framework/frozen.md).
-        with np.errstate(
-            invalid="ignore", over="ignore"
-        ):  # the caller checks for numbers that are not finite
-            result = numbers @ self.weight
-            result += self.bias
-        return np.maximum(result, 0, out=result) if self.rectified else result
+    def of_one(self, registers: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the outputs of the layer for one sample, (1, outputs)."""
+        outputs = np.empty((1, len(self.bias)), self.bias.dtype)
+        compute_layer(registers[self.source][0], self.weight, self.bias, self.rectified, outputs[0])
+        return outputs
+
+    def of_batch(self, registers: Sequence[Tensor]) -> Tensor:
+        """Return the outputs of the layer for a batch, (batch, outputs)."""
+        weight, bias = self.tensors or (torch.from_numpy(self.weight), torch.from_numpy(self.bias))
+        outputs = torch.addmm(bias, registers[self.source], weight)
+        return outputs.relu_() if self.rectified else outputs
 
 
 class Concatenation(NamedTuple):
@@ -59,17 +60,24 @@ class Concatenation(NamedTuple):
 
     sources: tuple[int, ...]
 
-    def __call__(self, registers: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the concatenated registers, (batch, sum of lengths)."""
+    def of_one(self, registers: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the concatenated registers of one sample, (1, sum of lengths)."""
         return np.concatenate([registers[source] for source in self.sources], 1)
+
+    def of_batch(self, registers: Sequence[Tensor]) -> Tensor:
+        """Return the concatenated registers of a batch, (batch, sum of lengths)."""
+        return torch.cat([registers[source] for source in self.sources], 1)
 
 
 @dataclass
 class Network:
     """Sequence of steps that computes raw parameters from features.
 
-    The intermediate arrays are called registers and numbered. Register 0 has the features, (batch, length). Each step
+    The intermediate results are called registers and numbered. Register 0 has the features, (batch, length). Each step
     reads registers of earlier numbers, and its output is the next register.
+
+    For one sample the layers are compiled functions. For two or more, torch is faster, because it reads the weights
+    once for all of them (benchmarks/framework/frozen.md).
 
     Attributes:
         steps: the steps, in order.
@@ -85,10 +93,16 @@ class Network:
 
     def __call__(self, features: np.ndarray) -> np.ndarray:
         """Return the raw parameters, or the class logits, for features."""
-        registers = [features]
-        for step in self.steps:
-            registers.append(step(registers))
-        return registers[self.result]
+        if len(features) == 1:
+            arrays = [features]
+            for step in self.steps:
+                arrays.append(step.of_one(arrays))
+            return arrays[self.result]
+        with torch.inference_mode():
+            tensors = [torch.from_numpy(features)]
+            for step in self.steps:
+                tensors.append(step.of_batch(tensors))
+            return tensors[self.result].numpy()
 
     def cast(self, dtype: np.dtype) -> None:
         """Convert weights and biases to the type in which the network computes."""
@@ -97,6 +111,7 @@ class Network:
             if isinstance(step, Layer):
                 step.weight = np.ascontiguousarray(step.weight, dtype=dtype)
                 step.bias = step.bias.astype(dtype)
+                step.tensors = torch.from_numpy(step.weight), torch.from_numpy(step.bias)
 
 
 def read_network(model: Model, shape: tuple[int, ...]) -> Network | None:
@@ -349,10 +364,30 @@ def compute_layer(numbers, weight, bias, rectified, outputs):
                 outputs[j] = 0
 
 
+def to_probabilities(logits: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Return the softmax of each row of `logits`, which is overwritten, and whether all logits are finite.
+
+    A row with a number that is not finite becomes NaN.
+    """
+    if len(logits) <= FEW:
+        return logits, softmax(logits)
+    tensor = torch.from_numpy(logits)
+    probabilities = torch.softmax(tensor, 1)
+    if math.isfinite(tensor.sum()):  # a finite sum has only finite summands
+        return probabilities.numpy(), True
+    finite = tensor.isfinite().all(1)
+    probabilities[~finite] = math.nan
+    return probabilities.numpy(), bool(finite.all())
+
+
 @compiled
 @no_type_check
 def softmax(logits):
-    """Replace each row of `logits`, in place, by its softmax; a row with a number that is not finite becomes NaN."""
+    """Replace each row of `logits`, in place, by its softmax; a row with a number that is not finite becomes NaN.
+
+    Return whether all logits are finite.
+    """
+    all_finite = True
     for row in range(logits.shape[0]):
         largest = logits[row, 0]
         for j in range(logits.shape[1]):
@@ -362,5 +397,7 @@ def softmax(logits):
             total += 0 * logits[row, j]  # 0 times infinity is NaN
             logits[row, j] = np.exp(logits[row, j] - largest)
             total += logits[row, j]
+        all_finite = all_finite and total == total  # NaN is not equal to itself
         for j in range(logits.shape[1]):
             logits[row, j] /= total
+    return all_finite
