@@ -46,10 +46,17 @@ def unit_ball(clouds, counts, normalised, centre, scale):
         length = np.sqrt(largest)
         if length == 0:
             length = 1.0
-        for point in range(count):
-            out[point, 0] = ((cloud[point, 0] - x) - mean_x) / length
-            out[point, 1] = ((cloud[point, 1] - y) - mean_y) / length
-            out[point, 2] = ((cloud[point, 2] - z) - mean_z) / length
+        if cloud.shape[1] == 3:  # the same numbers; the compiler makes vectors of them if the stride is known
+            numbers, results = cloud.reshape(-1), out.reshape(-1)
+            for point in range(count):
+                results[3 * point] = ((numbers[3 * point] - x) - mean_x) / length
+                results[3 * point + 1] = ((numbers[3 * point + 1] - y) - mean_y) / length
+                results[3 * point + 2] = ((numbers[3 * point + 2] - z) - mean_z) / length
+        else:
+            for point in range(count):
+                out[point, 0] = ((cloud[point, 0] - x) - mean_x) / length
+                out[point, 1] = ((cloud[point, 1] - y) - mean_y) / length
+                out[point, 2] = ((cloud[point, 2] - z) - mean_z) / length
         for point in range(count, cloud.shape[0]):
             out[point, :3] = np.nan
         for column in range(3, cloud.shape[1]):

@@ -105,7 +105,8 @@ def nearest(
         queries = prepare(queries, once=True)
     points = queries.points if isinstance(queries, Queries) else queries.detach()
     require_points(clouds, "clouds")
-    require_points(points if own else points[None], "queries")
+    if own:
+        require_points(points, "queries")
     if points.dtype != clouds.dtype or points.device != clouds.device or (own and len(points) != len(clouds)):
         raise DataError(
             f"Queries of shape {tuple(points.shape)}, {points.dtype} on {points.device} do not fit clouds of shape "
@@ -159,6 +160,9 @@ def require_sizes(points: Tensor, sizes: Tensor | None, name: str) -> Tensor | N
     if sizes is None:
         return None
     sizes = sizes.to("cpu", torch.int64)
+    counts = sizes.tolist()  # for usual batches, numbers of Python are faster than tensors of one number
+    if len(counts) == len(points) and (not counts or 1 <= min(counts) <= max(counts) <= points.shape[1]):
+        return sizes
     wrong = ((sizes < 1) | (sizes > points.shape[1])).nonzero()
     if len(sizes) != len(points) or len(wrong):
         fault = (
@@ -212,7 +216,9 @@ def on_processor(
         queries.largest if isinstance(queries, Queries) else 0.0,
     )
     distance, index = torch.from_numpy(results.distance), torch.from_numpy(results.index)
-    for i, outcome in enumerate(results.outcome.tolist() if results.outcome.any() else ()):
+    for i, outcome in enumerate(results.outcome.tolist()):
+        if outcome == processor.FINE:
+            continue
         if outcome == processor.BAD_CLOUD:
             refuse_bad(clouds, sizes, "clouds")
         elif outcome == processor.BAD_QUERIES:

@@ -240,26 +240,33 @@ def packed_well(points: Array) -> Packed:
 UNUSED = {dtype.itemsize: room(1, dtype) for dtype in (np.dtype(np.float32), np.dtype(np.float64))}
 
 
+KEPT = 2**20
+"""Largest number of points or queries of which working memory is kept, which is then 25 MB for each thread."""
+
+
 class Desks(local):
-    """Working memory of each thread; it is kept for small clouds, since allocating takes as long as searching."""
+    """Working memory of each thread, which is kept, since new memory takes a large share of the time of a search."""
 
     def __init__(self) -> None:
-        self.cached: dict[tuple[int, int, np.dtype], tuple[Bench, Packed, Packed]] = {}
+        self.cached: dict[tuple[int, int, np.dtype, int], tuple[Bench, Packed, Packed]] = {}
 
-    def of(self, points: int, queries: int, dtype: np.dtype) -> tuple[Bench, Packed, Packed]:
+    def of(
+        self, points: int, queries: int, dtype: np.dtype, threads: int = 1
+    ) -> tuple[Bench, Packed, Packed]:
         """Return working memory of packing, memory for a packed cloud, and memory for its packed queries.
 
         Args:
             points: largest number of points of a cloud.
             queries: largest number of queries of a cloud; 0 if all clouds share their queries.
             dtype: type of the coordinates.
+            threads: number of threads that pack a cloud.
         """
-        key = points, queries, dtype
+        key = points, queries, dtype, threads
         if key in self.cached:
             return self.cached[key]
         own = room(queries, dtype) if queries else UNUSED[dtype.itemsize]
-        memory = bench(max(points, queries)), room(points, dtype), own
-        if max(points, queries) < LARGE:
+        memory = bench(max(points, queries), threads), room(points, dtype), own
+        if max(points, queries) <= KEPT:
             self.cached = {key: memory}  # at most one entry
         return memory
 
@@ -361,9 +368,11 @@ def solve_one(problem: Problem, i: int, cells: NDArray[np.int32], threads: int) 
         return
     number = int(problem.packets.levels[8])
     packing = worth_packing(size, number)
-    packed = room(size, cloud.dtype) if packing else None
-    if packed is not None:
-        pack_together(cloud, size, box, cells, packed, threads)
+    packed = None
+    if packing:
+        packers = max(1, min(threads, size // LARGE))
+        work, packed, _ = DESKS.of(size, 0, cloud.dtype, packers)
+        pack_together(cloud, size, box, cells, work, packed, packers)
     step = max(1, number // (TURNS * threads))
     counter = np.zeros(1, np.int64)
 
@@ -394,7 +403,7 @@ def extent_together(cloud: Array, size: int, threads: int) -> Array | None:
 
 
 def pack_together(
-    cloud: Array, size: int, box: Array, cells: NDArray[np.int32], packed: Packed, threads: int
+    cloud: Array, size: int, box: Array, cells: NDArray[np.int32], work: Bench, packed: Packed, threads: int
 ) -> None:
     """Pack a cloud in several threads; each thread counts, and then stores, its share of the points.
 
@@ -403,11 +412,11 @@ def pack_together(
         size: number of points.
         box: lowest and highest coordinates, as computed by `extent`.
         cells: cells in the order of the Hilbert curve, as `curve` returns them.
+        work: working memory for as many threads.
         packed: filled with the packed cloud.
-        threads: largest number of threads.
+        threads: number of threads.
     """
-    threads = max(1, min(threads, size // LARGE))
-    bits, work = cell_bits(size), bench(size, threads)
+    bits = cell_bits(size)
     leaves = -(-size // LANES)
     cuts = [leaves * thread // threads for thread in range(threads + 1)]
 

@@ -12,7 +12,15 @@ from framework.errors import ConfigError
 from framework.geometry.clouds import Normalisation, require_clouds
 from framework.storage.weights import FINITE, require_state
 from plugins.encoder.bps import basis as sets
-from plugins.encoder.bps.encoding import Basis, channels, columns_of, encode, prepare_basis, width
+from plugins.encoder.bps.encoding import (
+    Basis,
+    channels,
+    columns_of,
+    encode,
+    prepare_basis,
+    quick_distances,
+    width,
+)
 
 
 class BPS(Encoder):
@@ -81,9 +89,14 @@ class BPS(Encoder):
 
     def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
         """Return the features of the clouds."""
+        basis = self.prepared_basis()
+        if self.features == ["distance"] and self.normalise == "unit_ball" and not self.rotation_invariant:
+            distances = quick_distances(inputs, basis)
+            if distances is not None:
+                return distances.reshape(-1, *self.output_shape)
         encoding = encode(
             inputs,
-            self.prepared_basis(),
+            basis,
             self.features,
             self.normalise,
             self.columns,

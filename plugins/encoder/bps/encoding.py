@@ -16,6 +16,7 @@ from framework.geometry.clouds import (
     pad,
     require_normalised,
     sizes,
+    unit_ball_clouds,
 )
 from framework.geometry.nearest import Queries, nearest, prepare
 from plugins.encoder.bps.frame import frame
@@ -150,6 +151,30 @@ def encode(
             attribute = _gather_rows(local[..., indices], neighbours.index).to(basis.points.dtype)
             values[feature] = attribute if width(feature) == 3 else attribute[..., 0]
     return Encoding(values, neighbours.index, basis.points, centre, scale, axes)
+
+
+def quick_distances(clouds: Tensor, basis: Basis) -> Float[Tensor, "batch k"] | None:
+    """Return the feature "distance" of clouds that are normalised to the unit ball, to the bit as `encode` does.
+
+    It returns None, and `encode` must be called, for clouds with padding, attributes, a gradient or bad numbers, of
+    another type than float32 or on another device than the CPU. For one cloud of 2,048 points, the checks and tensors
+    that it leaves out take half as long as the search itself.
+    """
+    if (
+        clouds.device.type != "cpu"
+        or not clouds.dtype == basis.points.dtype == torch.float32
+        or clouds.dim() != 3
+        or clouds.shape[2] != 3
+        or 0 in clouds.shape
+        or (clouds.requires_grad and torch.is_grad_enabled())
+    ):
+        return None
+    from framework.geometry.nearest.processor import search_batch
+
+    counts = torch.full((len(clouds),), clouds.shape[1])
+    local = unit_ball_clouds(clouds.detach(), counts).clouds  # NaN where a cloud has padding or bad numbers
+    results = search_batch(local.numpy(), None, basis.queries.packed, None, basis.queries.largest)
+    return None if any(results.outcome.tolist()) else torch.from_numpy(results.distance)
 
 
 def channels(encoding: Encoding) -> Float[Tensor, "batch channels k"]:

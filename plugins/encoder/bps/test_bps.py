@@ -14,7 +14,7 @@ from framework.errors import ConfigError, DataError, UserError
 from framework.geometry.clouds import normalise_clouds, pad, sizes
 from plugins.encoder.bps import encoding
 from plugins.encoder.bps.basis import basis
-from plugins.encoder.bps.encoding import channels, decode, encode, per_point, prepare_basis
+from plugins.encoder.bps.encoding import channels, decode, encode, per_point, prepare_basis, quick_distances
 from plugins.encoder.bps.frame import frame
 from plugins.encoder.bps.rows import COLUMNS
 
@@ -543,6 +543,19 @@ def test_channels_come_one_after_the_other_and_x_is_slowest():
     wanted = encode(clouds, flat.prepared_basis(), ["distance", "delta"]).features
     assert torch.equal(flat(clouds)[:, :8], wanted["distance"])
     assert torch.equal(flat(clouds)[:, 8:].unflatten(1, (3, 8)), wanted["delta"].mT)
+
+
+@pytest.mark.parametrize("lengths", [[300, 300], [1], [30, 12]])
+def test_distances_alone_have_the_bits_of_encode(lengths):
+    encoder, clouds = build_encoder(points=100), batch_of(lengths, dtype=torch.float32)
+    quick = quick_distances(clouds, encoder.prepared_basis())
+    assert (quick is None) == (len(set(lengths)) > 1)  # padding is left to `encode`
+    assert torch.equal(encoder(clouds), encode(clouds, encoder.prepared_basis()).features["distance"])
+    if quick is not None:
+        assert torch.equal(quick, encoder(clouds))
+        clouds[-1, 0, 1] = math.inf
+        with pytest.raises(DataError, match=r"holds inf in column 1 of point 0"):
+            encoder(clouds)
 
 
 def test_the_basis_is_stored_and_followed_when_it_is_loaded_cast_or_copied():
