@@ -1,4 +1,4 @@
-"""Frozen models give the numbers of their predictors; fully connected networks run without torch."""
+"""Frozen models give the numbers of their predictors; fully connected networks run without the model."""
 
 import math
 
@@ -81,6 +81,9 @@ def test_probabilities_are_the_predictors(shape, widths, batch_norm, dtype):
     assert form(torch.randn(1, *shape, dtype=dtype)).dtype == np.dtype(str(dtype)[6:])
     assert form(torch.randn(2, *shape, dtype=torch.float64)).dtype == np.dtype(str(dtype)[6:])
     inputs = torch.randn(3, *shape, dtype=dtype)
+    unwritable = inputs.numpy().copy()
+    unwritable.flags.writeable = False
+    np.testing.assert_array_equal(form(unwritable), form(inputs))
     torch.testing.assert_close(form.density(inputs).probs, model(inputs).probs, rtol=0, atol=limit)
 
 

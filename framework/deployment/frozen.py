@@ -141,8 +141,8 @@ class Frozen:
             batch = user_batch(self.data, inputs)
             inputs, frame = batch["input"], self.data.frame(batch)
         if self.front_end is not None:
-            with torch.no_grad():
-                inputs = self.front_end.features(_to_tensor(inputs))
+            # detached instead of computed without gradient, because the parameters of the copy require none
+            inputs = self.front_end.features(_to_tensor(inputs).detach())
         if self.shape is None:
             self.shape = tuple(inputs.shape[1:])
             self._read(self.shape)

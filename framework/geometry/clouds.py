@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -151,7 +152,8 @@ def normalise_clouds(
         origin = torch.zeros(count, 3, dtype=torch.float64, device=clouds.device)
         return NormalisedClouds(clouds, origin, torch.ones_like(origin[:, 0]))
     if how == "unit_ball" and clouds.device.type == "cpu":
-        normalised = unit_ball_clouds(clouds.detach(), counts)
+        arrays = unit_ball_arrays(clouds.detach().contiguous().numpy(), counts.numpy())
+        normalised = NormalisedClouds(*(torch.from_numpy(array).to(clouds.device) for array in arrays))
         if clouds.requires_grad and torch.is_grad_enabled():  # adds a gradient and changes no bit
             traced = _composed(clouds, how, counts)
             pairs = zip(normalised, traced, strict=True)
@@ -167,24 +169,21 @@ def normalise_clouds(
     return normalised
 
 
-def unit_ball_clouds(clouds: Tensor, counts: Tensor) -> NormalisedClouds:
-    """Return clouds normalised by "unit_ball" with compiled code for the CPU, one cloud after the other.
+def unit_ball_arrays(clouds: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return clouds normalised by "unit_ball", their centres and their scales (`NormalisedClouds`), by compiled code.
 
     This takes a third of the time of tensor operations. The clouds are not checked; the result of a cloud with a number
     that is NaN or infinite contains NaN.
 
     Args:
-        clouds: (batch, points, columns), on the CPU, without gradient.
-        counts: number of points of each cloud.
+        clouds: (batch, points, columns), contiguous.
+        counts: number of points of each cloud, int64.
     """
     from framework.geometry.clouds_compiled import unit_ball
 
-    clouds = clouds.contiguous()  # the function is compiled for contiguous arrays only
-    normalised = torch.empty_like(clouds)
-    centre = torch.empty(len(clouds), 3, dtype=torch.float64)
-    scale = torch.empty(len(clouds), dtype=torch.float64)
-    unit_ball(clouds.numpy(), counts.numpy(), normalised.numpy(), centre.numpy(), scale.numpy())
-    return NormalisedClouds(normalised, centre, scale)
+    normalised, centre, scale = np.empty_like(clouds), np.empty((len(clouds), 3)), np.empty(len(clouds))
+    unit_ball(clouds, counts, normalised, centre, scale)
+    return normalised, centre, scale
 
 
 def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> NormalisedClouds:

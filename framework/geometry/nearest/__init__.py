@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -125,6 +126,24 @@ def nearest(
     if clouds.device.type == "cpu":
         return on_processor(clouds, queries, sizes, query_sizes)
     return on_device(clouds, points, sizes, query_sizes)
+
+
+def quick_distances(clouds: np.ndarray, queries: Queries) -> np.ndarray | None:
+    """Return the distances that `nearest` finds on the CPU, without its checks; None if `nearest` must be called.
+
+    It is called for clouds with a number that is NaN or infinite, and for coordinates of extreme magnitude.
+
+    Args:
+        clouds: (batch, points, 3), contiguous, at least one cloud of at least one point, of the dtype of the queries.
+        queries: queries that all clouds share, on the CPU.
+
+    Returns:
+        Distances, (batch, query), or None.
+    """
+    from framework.geometry.nearest.processor import search_batch
+
+    results = search_batch(clouds, None, queries.packed, None, queries.largest)
+    return None if any(results.outcome.tolist()) else results.distance
 
 
 def require_points(points: Tensor, name: str) -> None:

@@ -9,7 +9,7 @@ from numba.core.extending import intrinsic
 
 from framework.storage.kernels import compiler, kernel_cache
 
-PARTS = "compiled", "lanes", "pack", "search", "processor"
+PARTS = "compiled", "pack", "search", "processor"
 """Names of the files whose compiled functions call each other; after a change in one file, all are compiled again."""
 
 

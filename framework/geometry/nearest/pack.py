@@ -14,8 +14,7 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from numpy.typing import NDArray
 
-from framework.geometry.nearest.compiled import compiled, inlined
-from framework.geometry.nearest.lanes import (
+from framework.geometry.lanes import (
     LANES,
     fma,
     highest,
@@ -34,6 +33,7 @@ from framework.geometry.nearest.lanes import (
     whole,
     with_id,
 )
+from framework.geometry.nearest.compiled import compiled, inlined
 
 MODERATE = {4: (2.0**-40, 2.0**60), 8: (2.0**-40, 2.0**500)}
 """Smallest and largest accepted magnitude of the largest coordinate, by the number of bytes of a number.

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from framework.geometry.lanes import LANES
 from framework.geometry.nearest.compiled import compiled, fetch_and_add
-from framework.geometry.nearest.lanes import LANES
 from framework.geometry.nearest.pack import (
     BITS,
     MODERATE,

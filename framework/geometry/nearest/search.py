@@ -17,8 +17,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from framework.geometry.nearest.compiled import compiled, inlined
-from framework.geometry.nearest.lanes import (
+from framework.geometry.lanes import (
     LANES,
     bits,
     first,
@@ -37,6 +36,7 @@ from framework.geometry.nearest.lanes import (
     take,
     where,
 )
+from framework.geometry.nearest.compiled import compiled, inlined
 
 ALONE = 3
 """Largest number of queries, of sixteen, for which a node that they need is searched query by query; measured.

@@ -17,8 +17,8 @@ from plugins.encoder.bps.encoding import (
     channels,
     columns_of,
     encode,
+    encode_distances,
     prepare_basis,
-    quick_distances,
     width,
 )
 
@@ -91,7 +91,7 @@ class BPS(Encoder):
         """Return the features of the clouds."""
         basis = self.prepared_basis()
         if self.features == ["distance"] and self.normalise == "unit_ball" and not self.rotation_invariant:
-            distances = quick_distances(inputs, basis)
+            distances = encode_distances(inputs, basis)
             if distances is not None:
                 return distances.reshape(-1, *self.output_shape)
         encoding = encode(

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -16,9 +17,9 @@ from framework.geometry.clouds import (
     pad,
     require_normalised,
     sizes,
-    unit_ball_clouds,
+    unit_ball_arrays,
 )
-from framework.geometry.nearest import Queries, nearest, prepare
+from framework.geometry.nearest import Queries, nearest, prepare, quick_distances
 from plugins.encoder.bps.frame import frame
 
 COLOR = ("red", "green", "blue")
@@ -153,7 +154,7 @@ def encode(
     return Encoding(values, neighbours.index, basis.points, centre, scale, axes)
 
 
-def quick_distances(clouds: Tensor, basis: Basis) -> Float[Tensor, "batch k"] | None:
+def encode_distances(clouds: Tensor, basis: Basis) -> Float[Tensor, "batch k"] | None:
     """Return the feature "distance" of clouds that are normalised to the unit ball, to the bit as `encode` does.
 
     It returns None, and `encode` must be called, for clouds with padding, attributes, a gradient or bad numbers, of
@@ -169,12 +170,10 @@ def quick_distances(clouds: Tensor, basis: Basis) -> Float[Tensor, "batch k"] | 
         or (clouds.requires_grad and torch.is_grad_enabled())
     ):
         return None
-    from framework.geometry.nearest.processor import search_batch
-
-    counts = torch.full((len(clouds),), clouds.shape[1])
-    local = unit_ball_clouds(clouds.detach(), counts).clouds  # NaN where a cloud has padding or bad numbers
-    results = search_batch(local.numpy(), None, basis.queries.packed, None, basis.queries.largest)
-    return None if any(results.outcome.tolist()) else torch.from_numpy(results.distance)
+    array, counts = clouds.detach().contiguous().numpy(), np.full(len(clouds), clouds.shape[1])
+    local, _, _ = unit_ball_arrays(array, counts)  # NaN where a cloud has padding or bad numbers
+    distances = quick_distances(local, basis.queries)
+    return None if distances is None else torch.from_numpy(distances).to(clouds.device)
 
 
 def channels(encoding: Encoding) -> Float[Tensor, "batch channels k"]:

@@ -14,7 +14,7 @@ from framework.errors import ConfigError, DataError, UserError
 from framework.geometry.clouds import normalise_clouds, pad, sizes
 from plugins.encoder.bps import encoding
 from plugins.encoder.bps.basis import basis
-from plugins.encoder.bps.encoding import channels, decode, encode, per_point, prepare_basis, quick_distances
+from plugins.encoder.bps.encoding import channels, decode, encode, encode_distances, per_point, prepare_basis
 from plugins.encoder.bps.frame import frame
 from plugins.encoder.bps.rows import COLUMNS
 
@@ -548,7 +548,7 @@ def test_channels_come_one_after_the_other_and_x_is_slowest():
 @pytest.mark.parametrize("lengths", [[300, 300], [1], [30, 12]])
 def test_distances_alone_have_the_bits_of_encode(lengths):
     encoder, clouds = build_encoder(points=100), batch_of(lengths, dtype=torch.float32)
-    quick = quick_distances(clouds, encoder.prepared_basis())
+    quick = encode_distances(clouds, encoder.prepared_basis())
     assert (quick is None) == (len(set(lengths)) > 1)  # padding is left to `encode`
     assert torch.equal(encoder(clouds), encode(clouds, encoder.prepared_basis()).features["distance"])
     if quick is not None:

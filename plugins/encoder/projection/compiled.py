@@ -13,9 +13,9 @@ from typing import no_type_check
 
 import numpy as np
 
-from framework.geometry.nearest import lanes
-from framework.geometry.nearest.lanes import LANES, gather, load, mask, store, where
-from framework.geometry.nearest.lanes import splat as spread
+from framework.geometry import lanes
+from framework.geometry.lanes import LANES, gather, load, mask, store, where
+from framework.geometry.lanes import splat as spread
 from framework.storage.kernels import compiler, kernel_cache
 
 KERNELS = ("compiled",)

@@ -84,7 +84,7 @@ class SMPLpix(Renderer):
             if crop != "trained" and "crop" in part:
                 part["crop"] = None if crop == "whole" else crop
         self._predictors: dict[tuple[int, int], Predictor] = {}
-        if precision == "auto":
+        if precision == "auto" and any("precision" in part for part in self.description.config["encoder"]):
             exact, fast = self._test_image("float32"), self._test_image("auto")
             change = (fast - exact).abs()
             if not (change.max() <= LARGEST_CHANGE and change.mean() <= MEAN_CHANGE):
