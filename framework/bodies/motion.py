@@ -74,11 +74,15 @@ def read(file: Path) -> Motion:
         head, separator, rest = text.partition("MOTION")
         above = words_of(head)
         if not separator or above[:1] != ["HIERARCHY"]:
-            raise ValueError("the word HIERARCHY or MOTION is missing")
+            raise ValueError(
+                "the file lacks the word HIERARCHY at its beginning, or the word MOTION after the joints"
+            )
         names, parents, offsets, channels = _hierarchy(above[1:], text)
         words = words_of(rest)
         if words[:1] != ["Frames:"] or words[2:4] != ["Frame", "Time:"] or len(words) < 5:
-            raise ValueError("the part after MOTION does not begin with Frames: and Frame Time:")
+            raise ValueError(
+                "the part after MOTION does not begin with `Frames:` and `Frame Time:`, each followed by a number"
+            )
         before = len(above) + 1
         frames = _whole(words[1], text, before + 1)
         seconds, *values_of_frames = require_numbers_in(words[4:], text, before + 4)
@@ -125,12 +129,14 @@ def _hierarchy(
     while place < len(words):
         word = words[place]
         if word in ("OFFSET", "CHANNELS", "}", "End") and len(above) == 1:
-            raise ValueError(f"the word {word} occurs outside of all joints")
+            raise ValueError(
+                f"the word {word} occurs outside of all joints; expected the word between the braces of a joint"
+            )
         if word in ("ROOT", "JOINT"):
             if (word == "ROOT") != (len(above) == 1) or (word == "ROOT" and names):
                 raise ValueError(
-                    f"{word} {shorten(words[place + 1])} occurs at a place where no joint can begin; expected a single "
-                    "ROOT"
+                    f"{word} {shorten(words[place + 1])} occurs at a place where no such joint can begin; expected a "
+                    "single ROOT, and each JOINT within another joint"
                 )
             parents.append(above[-1])
             above.append(len(names))
@@ -143,15 +149,17 @@ def _hierarchy(
         elif word == "OFFSET":
             offsets[above[-1]] = require_numbers_in(words[place + 1 : place + 4], text, place + 2)
             if len(offsets[above[-1]]) != 3 or not np.isfinite(offsets[above[-1]]).all():
-                raise ValueError(f"the OFFSET of {shorten(names[above[-1]])} is not three finite numbers")
+                raise ValueError(
+                    f"the word OFFSET of joint {shorten(names[above[-1]])} is not followed by three finite numbers"
+                )
             place += 4
         elif word == "CHANNELS":
             count = _whole(words[place + 1], text, place + 2)
             kinds = words[place + 2 : place + 2 + count]
             if len(kinds) != count or not set(kinds) <= CHANNELS or len(set(kinds)) < count:
                 raise ValueError(
-                    f"CHANNELS of {shorten(names[above[-1]])}: expected the number of channels, and this many of "
-                    f"{', '.join(sorted(CHANNELS))}"
+                    f"CHANNELS of joint {shorten(names[above[-1]])}: expected the number of channels, and then as "
+                    f"many names out of {', '.join(sorted(CHANNELS))}"
                 )
             channels[above[-1]] = kinds
             place += 2 + count
@@ -161,10 +169,11 @@ def _hierarchy(
         else:
             line = line_of_word(text, place + 1)
             raise ValueError(
-                f"line {line}: got {shorten(word)} instead of the rest of the description of a joint"
+                f"line {line}: got {shorten(word)}, but the description of a joint continues only with OFFSET, "
+                "CHANNELS, JOINT, End Site or a brace"
             )
     if len(above) != 1 or not names:
-        raise ValueError("the file has no joints, or the description of a joint has no end")
+        raise ValueError("the file has no joints, or a joint lacks its closing brace")
     return names, parents, offsets, channels
 
 

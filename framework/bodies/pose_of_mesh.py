@@ -87,8 +87,9 @@ def fit_mesh(body: Body, vertices: Float[Tensor, "vertex 3"], usual: float = 1.0
     """
     if len(vertices) != len(body.template) or not vertices.isfinite().all():
         raise DataError(
-            f"A mesh has {len(vertices)} vertices, {int((~vertices.isfinite()).any(1).sum())} of them not finite; "
-            f"expected the {len(body.template)} vertices of {body.source}, metres. Register the mesh to that body."
+            f"A mesh has {len(vertices)} vertices, of which {int((~vertices.isfinite()).any(1).sum())} are not "
+            f"finite; expected the {len(body.template)} vertices of {body.source} with finite coordinates in metres. "
+            "Register the mesh to that body."
         )
     step = -(-len(vertices) // MOST)
     looked_at = {

@@ -94,7 +94,7 @@ def load(content: bytes) -> Any:
     except PickleRefused:
         raise
     except Exception as error:  # a damaged pickle can raise an error of any type
-        raise PickleRefused(f"it is damaged ({type(error).__name__}: {shorten(error)})") from error
+        raise PickleRefused(f"the pickle is damaged ({type(error).__name__}: {shorten(error)})") from error
 
 
 def _build_records(content: bytes) -> Any:
@@ -103,7 +103,7 @@ def _build_records(content: bytes) -> Any:
     memo: dict[int, Any] = {}
     for count, (opcode, argument, _) in enumerate(pickletools.genops(content)):
         if count == MOST_INSTRUCTIONS:
-            _refuse(f"it has more than {MOST_INSTRUCTIONS} instructions")
+            _refuse(f"the pickle has more than {MOST_INSTRUCTIONS} instructions")
         name = opcode.name
         if VALUES.fullmatch(name):
             stack.append(argument)
@@ -114,7 +114,9 @@ def _build_records(content: bytes) -> Any:
         elif name in ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"):
             number = len(memo) if name == "MEMOIZE" else int(argument or 0)
             if not 0 <= number <= MOST_INSTRUCTIONS:
-                _refuse(f"its memo skips to the number {number}")
+                _refuse(
+                    f"the memo of the pickle has the number {number}; expected numbers from 0 to {MOST_INSTRUCTIONS}"
+                )
             memo[number] = stack[-1]
         elif name in ("GET", "BINGET", "LONG_BINGET"):
             stack.append(memo[int(argument or 0)])
@@ -122,7 +124,7 @@ def _build_records(content: bytes) -> Any:
             return stack.pop()
         elif name not in ("PROTO", "FRAME"):
             _obey(name, argument, stack)
-    return _refuse("it has no end")
+    return _refuse("the pickle is cut short, because the instruction that ends it is missing")
 
 
 def _obey(name: str, argument: Any, stack: list[Any]) -> None:
@@ -150,7 +152,7 @@ def _obey(name: str, argument: Any, stack: list[Any]) -> None:
         case "APPEND" | "APPENDS":
             items = [stack.pop()] if name == "APPEND" else _since_mark(stack)
             if type(stack[-1]) is not list:
-                _refuse("it appends to an object that is no list")
+                _refuse("the pickle appends to an object that is no list")
             stack[-1].extend(items)
         case "SETITEM" | "SETITEMS":
             items = [stack.pop(), stack.pop()][::-1] if name == "SETITEM" else _since_mark(stack)
@@ -163,19 +165,19 @@ def _obey(name: str, argument: Any, stack: list[Any]) -> None:
         case "REDUCE" | "NEWOBJ":
             arguments, called = stack.pop(), stack.pop()
             if not isinstance(called, _Record) or called.called or type(arguments) is not tuple:
-                _refuse("it calls an object that is no name")
+                _refuse("the pickle calls an object that is not the name of a function or class")
             if called.kind == "_reconstructor":
                 called, arguments = arguments[0], ()
                 if not isinstance(called, _Record) or called.called:
-                    _refuse("it builds an object without a class")
+                    _refuse("the pickle builds an object without a class")
             stack.append(_Record(called.kind, arguments, called=True))
         case "BUILD":
             state = stack.pop()
             if not isinstance(stack[-1], _Record) or not stack[-1].called:
-                _refuse("it sets attributes of something that is no object")
+                _refuse("the pickle sets attributes of something that is no object")
             stack[-1].state = state
         case _:
-            _refuse(f"it has the instruction {name}, which arrays do not need")
+            _refuse(f"the pickle has the instruction {name}, which arrays do not need")
 
 
 def _since_mark(stack: list[Any]) -> list[Any]:
@@ -189,10 +191,12 @@ def _since_mark(stack: list[Any]) -> list[Any]:
 
 def _set(target: Any, items: list[Any]) -> None:
     if type(target) is not dict:
-        _refuse("it sets an item of an object that is no dictionary")
+        _refuse("the pickle sets an item of an object that is no dictionary")
     for key, value in zip(items[::2], items[1::2], strict=True):
         if not (isinstance(key, str | bytes) or (isinstance(key, int) and abs(key) < 2**31)):
-            _refuse(f"a dictionary has a key of type {type(key).__name__}; expected words or small numbers")
+            _refuse(
+                f"a dictionary has a key of type {type(key).__name__}; expected words or small numbers as keys"
+            )
         target[key] = value
 
 
@@ -201,7 +205,7 @@ def _named(module: Any, word: Any) -> _Record:
     if kind is None and str(module).startswith("scipy.sparse") and SPARSE.fullmatch(str(word)):
         kind = word[:3]
     if kind is None:
-        _refuse(f"it names {module}.{word}, which could run code or is not needed for arrays")
+        _refuse(f"the pickle names {module}.{word}, which could run code or is not needed for arrays")
     return _Record(kind)
 
 
@@ -227,7 +231,7 @@ class _Plain:
 
     def of(self, item: Any, depth: int) -> Any:
         if depth > DEEPEST:
-            _refuse(f"it is nested more than {DEEPEST} deep, or within itself")
+            _refuse(f"the pickle is nested more than {DEEPEST} deep, or within itself")
         if item is None or isinstance(item, str | bytes | int | float):
             return item
         if id(item) not in self.converted:
@@ -243,7 +247,7 @@ class _Plain:
             return bytes(item)
         if not isinstance(item, _Record) or not item.called:
             _refuse(
-                f"it holds the bare name {item.kind if isinstance(item, _Record) else type(item).__name__}"
+                f"the pickle holds the bare name {item.kind if isinstance(item, _Record) else type(item).__name__}"
             )
         # bare names may be arguments: the original class of an array is irrelevant
         bare = [isinstance(value, _Record) and not value.called for value in item.arguments]
@@ -274,7 +278,7 @@ class _Plain:
                 flat, places = np.ravel(_unwrap(state, "a")), _unwrap(state, "idxs")
                 self._spend(places.size * flat.itemsize)
                 return flat[places].reshape(state.get("preferred_shape", places.shape))
-        _refuse(f"it holds the bare name {item.kind}")
+        _refuse(f"the pickle holds the bare name {item.kind}")
 
     def _array(self, shape: Any, dtype: Any, fortran: Any, raw: Any) -> np.ndarray:
         if not isinstance(dtype, np.dtype):
@@ -282,7 +286,7 @@ class _Plain:
         raw = raw.encode("latin1") if isinstance(raw, str) else raw  # Python 2 wrote text
         sides = tuple(shape) if isinstance(shape, list | tuple) else ()
         if not isinstance(raw, bytes) or len(sides) > MOST_SIDES or not all(map(_side, sides)):
-            _refuse("it holds an array of Python objects")
+            _refuse("the pickle holds an array of Python objects")
         size = dtype.itemsize * math.prod(sides)
         if size != len(raw):
             _refuse(
@@ -294,7 +298,7 @@ class _Plain:
     def _spend(self, size: int) -> None:
         self.bytes_left -= size
         if self.bytes_left < 0:
-            _refuse("it expands to much more data than the file holds")
+            _refuse("the pickle expands to much more data than the file holds")
 
     def _sparse(self, kind: str, state: Mapping[str, Any]) -> np.ndarray:
         """Return a sparse matrix as a dense array; entries at the same position are added.
@@ -346,7 +350,7 @@ def _dtype(text: Any, state: Any) -> np.dtype:
         return dtype
     order = state[1].decode("latin1") if isinstance(state[1], bytes) else state[1]
     if any(part is not None for part in state[2:5]):
-        _refuse("it holds an array of records; expected numbers or text")
+        _refuse("the pickle holds an array of records; expected numbers or text")
     return dtype.newbyteorder(order) if order in ("<", ">") else dtype
 
 
@@ -384,5 +388,5 @@ def _only_bytes(value: Any) -> bytes:
     return (
         bytes(value)
         if isinstance(value, bytes)
-        else _refuse("it builds bytes from something other than bytes")
+        else _refuse("the pickle builds bytes from something other than bytes")
     )

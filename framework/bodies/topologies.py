@@ -167,9 +167,9 @@ def recognise_topology(
             "file of this mesh's body as --body."
         )
     raise DataError(
-        f"{source}: no mesh of {body.source} has {vertices} vertices; it has {len(body.template)}, and "
-        f"{', '.join(map(str, COUNTS.values()))} when decimated or split. Set the body to which this mesh is "
-        "registered."
+        f"{source}: the mesh has {vertices} vertices, but the meshes of {body.source} have {len(body.template)} "
+        f"vertices, or {', '.join(map(str, COUNTS.values()))} when they are decimated or split. Set the body to "
+        "which this mesh is registered."
     )
 
 

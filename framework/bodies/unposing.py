@@ -59,7 +59,8 @@ def unpose(
     residuals = vertices - model(shape, pose, translation)
     if not residuals.isfinite().all():
         raise ValueError(
-            "the vertices are not all finite; expected finite coordinates of every vertex, metres."
+            f"{int((~residuals.isfinite()).any(-1).sum())} vertices have a coordinate that is not finite; expected "
+            "finite coordinates in metres. Correct or leave out this mesh."
         )
     left, values, right = torch.linalg.svd(model.skinning(shape, pose).double())
     inverse = torch.where(values < SMALLEST, values / SMALLEST**2, 1 / values.clamp(min=SMALLEST))

@@ -109,7 +109,7 @@ def test_vertices_of_a_topology_bend_with_the_body(doll, default, name):
 
 def test_meshes_of_other_bodies_are_told(doll):
     mesh = topology(doll, sheet(doll), "14k")
-    with pytest.raises(DataError, match=r"no mesh of .* has 131 vertices; it has 132"):
+    with pytest.raises(DataError, match=r"the mesh has 131 vertices, but the meshes of .* have 132 vertices"):
         recognise_topology(doll, 131, mesh.faces, "one.ply")
     with pytest.raises(DataError, match=r"as many vertices as .* \(132\) but different triangles"):
         recognise_topology(doll, 132, np.flip(mesh.faces + 1, 0) % 132, "one.ply")
@@ -223,7 +223,7 @@ WRONG = {
     "infinite": (["--pose", "left elbow=inf"], "from -10000 to 10000"),
     "no direction": (["--shape", "4=1"], "'4' is no direction; expected a number from 0 to 3"),
     "no file": (["--motion", "none.bvh"], "none.bvh: no such file"),
-    "another body": ([], "no mesh of .* has 40 vertices"),
+    "another body": ([], "the mesh has 40 vertices, but the meshes of"),
     "twice": (["ann"], "the name ann occurs twice"),
 }
 
