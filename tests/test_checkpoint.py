@@ -120,7 +120,8 @@ def test_a_refusal_names_the_newest_whole_checkpoint_beside_it(saved: Path) -> N
         read(saved.with_name("none.ckpt"))
     saved.write_bytes(b"")
     with pytest.raises(
-        CheckpointError, match=r"last\.ckpt cannot .*the file is empty\. This folder contains no undamaged"
+        CheckpointError,
+        match=r"last\.ckpt cannot .*the file is empty\. The folder of this checkpoint contains no undamaged",
     ):
         read(saved)
     with pytest.raises(CheckpointError, match="There is no checkpoint"):
@@ -368,7 +369,7 @@ def test_only_dense_tensors_are_written_and_read(kind: str, saved: Path) -> None
     assert same(read(saved), CONTENTS)
     content = packed({"a": [held]})
     with pytest.raises(
-        CheckpointError, match=r"forged\.ckpt (contains more than .*, namely|cannot be used: a has )"
+        CheckpointError, match=r"forged\.ckpt (contains more than .* tensors: |cannot be used: a has )"
     ):
         read(signed(content, saved.with_name("forged.ckpt")))
     saved.with_name("one.pth").write_bytes(content)

@@ -66,7 +66,11 @@ def test_a_mode_reads_a_setting_or_refuses_it(mode: str) -> None:
             with pytest.raises(ConfigError) as refused:
                 require_read(mode, ["seed=1", written])
             said = str(refused.value)
-            assert written in said and f"mode={mode} reads no {called}" in said and "Leave it out" in said
+            assert (
+                written in said
+                and f"mode={mode} reads no {called}" in said
+                and "Leave this setting out" in said
+            )
             assert mode not in re.split("[;,] ", said.partition(f"reads no {called}")[2]), (
                 "it names other modes, which read it"
             )
@@ -225,7 +229,7 @@ def test_each_key_of_the_trainer_is_ours_or_lightnings_or_refused() -> None:
 )
 def test_what_another_setting_leaves_without_effect_is_said(override: str, values: dict[str, Any]) -> None:
     (said,) = idle_sentences(values, ["seed=1", override])
-    assert override in said and "Leave it out" in said
+    assert override in said and "Leave this setting out" in said
     used = {
         "logger": {"name": "mlflow"},
         "trainer": {"gradient_clip_val": 1.0},

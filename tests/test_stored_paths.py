@@ -276,7 +276,7 @@ def test_a_path_said_again_is_used(framework: Framework, tmp_path: Path) -> None
     test = ["mode=test", f"checkpoint={run.folder}", "logger=none"]
     refused = framework(*test, folder="test")
     assert refused.code == 2 and f"data.path = '{table}'" in refused.out
-    again = shlex.split(refused.out.split("Add to a command: ")[1].split(";")[0])
+    again = shlex.split(refused.out.split("`python -m framework`, add ")[1].split(". In the")[0])
     assert again == [f"data.path='{table}'"]
     tested = framework(*test, *again, folder="test")
     assert tested.code == 0, tested.out

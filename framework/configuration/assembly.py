@@ -70,8 +70,8 @@ def assemble(settings: Settings) -> Assembly:
             group == "encoder" and _is_fitted_at_once(settings.density_head)
         ):
             raise ConfigError(
-                f"No {group} is chosen. Name an experiment (`experiment=...`; `--help` lists them), "
-                f"or one of the installed: {group}={'|'.join(installed(group))}."
+                f"No {group} is chosen. Name an experiment (`experiment=...`; `--help` lists them), or choose an "
+                f"installed {group}: {group}={'|'.join(installed(group))}."
             )
     resolved: Resolved = {
         "data": resolve("data", settings.data),

@@ -143,7 +143,8 @@ def stored_shape(stored: Sequence[Any]) -> tuple[int, ...]:
     shape = tuple(map(int, stored[: MOST_SIDES + 1]))
     if len(shape) > MOST_SIDES or min(shape, default=0) < 0 or math.prod(shape) > MOST_INPUT:
         raise ValueError(
-            f"inputs of shape {quote(list(shape))}; at most {MOST_SIDES} dimensions and {MOST_INPUT} numbers are read"
+            f"the stored model reads inputs of shape {quote(list(shape))}, but at most {MOST_SIDES} dimensions and "
+            f"{MOST_INPUT} numbers, and no negative sizes, are allowed"
         )
     return shape
 
@@ -155,10 +156,14 @@ def stored_names(stored: Sequence[Any], description: str) -> tuple[str, ...]:
         ValueError: There are too many names, or one is too long.
     """
     if len(stored) > MOST_NAMES:
-        raise ValueError(f"{len(stored)} {description}, but at most {MOST_NAMES} are allowed")
+        raise ValueError(
+            f"the stored model has {len(stored)} {description}, but at most {MOST_NAMES} are allowed"
+        )
     names = tuple(map(str, stored))
     if any(len(name) > LONGEST_NAME for name in names):
-        raise ValueError(f"{description} with more than {LONGEST_NAME} characters")
+        raise ValueError(
+            f"the stored model has {description} of more than {LONGEST_NAME} characters, which is not allowed"
+        )
     return names
 
 
@@ -174,7 +179,8 @@ def stored_settings(stored: Mapping[str, Any], target: Target) -> dict[str, Any]
     samples, numbers = values["samples"], math.prod(target.event_shape)
     if samples > MOST_DRAWS or samples * numbers > max(MOST_DRAWN, 1000 * numbers):
         raise ValueError(
-            f"settings.samples = {samples}; at most {MOST_DRAWS} samples and {MOST_DRAWN} numbers in all are allowed"
+            f"the stored model has settings.samples = {samples}, but at most {MOST_DRAWS} samples and {MOST_DRAWN} "
+            "numbers in all are allowed"
         )
     return {key: values[key] for key in inherited}
 
@@ -190,19 +196,28 @@ def stored_target(stored: Mapping[str, Any]) -> Target:
     sizes = {len(location), len(scale)}
     size = tuple(map(int, stored.get("size", ())))
     if kind not in get_args(Kind):
-        raise ValueError(f"a target of kind {quote(kind)} with the names {quote(names)}")
+        raise ValueError(
+            f"the stored target has the kind {quote(kind)}; expected one of the kinds {', '.join(get_args(Kind))}"
+        )
     if len(size) != 2 * (kind == "image") or min(size, default=1) < 1:
-        raise ValueError(f"a target of kind {kind!r} with the size {quote(size)}")
+        raise ValueError(
+            f"the stored target of kind {kind!r} has the size {quote(size)}; expected a height and a width for an "
+            "image, and no size for another kind"
+        )
     if math.prod(size) * len(names) > MOST_INPUT:
         raise ValueError(
-            f"a target of size {quote(size)} with {len(names)} numbers; at most {MOST_INPUT} numbers in all are read"
+            f"the stored target has the size {quote(size)} and {len(names)} numbers for each pixel, but at most "
+            f"{MOST_INPUT} numbers in all are allowed"
         )
     if (
         sizes not in ({0}, {len(names)})
         or not all(map(math.isfinite, location + scale))
         or min(scale, default=1) <= 0
     ):
-        raise ValueError("a target whose location and scale are not finite, or whose scale is not above 0")
+        raise ValueError(
+            "the stored location and scale of the target are not finite, have a scale that is not above 0, or do "
+            "not have one number for each name"
+        )
     return Target(kind, names, location, scale, size)
 
 

@@ -57,7 +57,7 @@ def _group(file: Path, folder: Path) -> str:
 
 def _require_harmless(file: Path, folder: Path, groups: Collection[str]) -> None:
     try:
-        content = read_yaml(file, "a config", "Correct it, or remove it from the folder.", ConfigError)
+        content = read_yaml(file, "a config", "Correct the file, or remove it from the folder.", ConfigError)
     except ConfigError as error:
         if isinstance(error.__cause__, yaml.YAMLError | UnicodeDecodeError):
             return  # Hydra cannot read it either, and reports the place of the error

@@ -30,7 +30,7 @@ from framework.storage.reading import translate_errors
 from framework.storage.weights import describe_mismatch
 from framework.target import Target
 
-FOREIGN = "This framework did not write the file. Do not use it."
+FOREIGN = "This framework did not write the file. Do not use the file."
 PREFIX = "predictor."
 """Prefix of the predictor's parameter names in Lightning's checkpoints."""
 

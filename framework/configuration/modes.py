@@ -137,7 +137,7 @@ def require_read(mode: str, overrides: Sequence[str]) -> None:
             root = name.partition(".")[0]
             root = shorten(name if any(readable.startswith(f"{root}.") for readable in read) else root)
             raise ConfigError(
-                f"{_as_typed(override)}: mode={mode} reads no {root}{_readers(name)}. Leave it out."
+                f"{_as_typed(override)}: mode={mode} reads no {root}{_readers(name)}. Leave this setting out."
             )
 
 
@@ -156,7 +156,7 @@ def idle_sentences(values: Mapping[str, Any], overrides: Sequence[str]) -> Itera
 
 def idle_sentence(override: str, why: str) -> str:
     """Return the sentence that says that a setting has no effect, and why."""
-    return f"{_as_typed(override)} has no effect: {why}. Leave it out."
+    return f"{_as_typed(override)} has no effect: {why}. Leave this setting out."
 
 
 def key_of(override: str) -> str:

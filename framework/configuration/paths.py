@@ -170,10 +170,10 @@ def require_paths(dropped: Mapping[str, Any], groups: Collection[str], source: s
         named = ", ".join(f"{shorten(key)} = {quote(value)}" for key, value in needed.items())
         example = ", ".join(f'"{shorten(key)}": ...' for key in needed)
         raise ConfigError(
-            f"{shorten(source)} contains a path: {named}. A checkpoint may come from an untrusted source, so its paths "
-            f"are used only if you repeat them; another path is allowed too. Add to a command: "
-            f"{' '.join(shell_arguments(needed))}; to the command of a plugin: the same, each after --path; to the "
-            f"call of framework.load or freeze: paths={{{example}}}."
+            f"{shorten(source)} contains a path: {named}. A checkpoint may come from an untrusted source, so a path "
+            "in it is used only if you repeat this path or give another one. In a command of `python -m framework`, "
+            f"add {' '.join(shell_arguments(needed))}. In the command of a plugin, write --path before each of these "
+            f"settings. In a call of framework.load or framework.freeze, add paths={{{example}}}."
         )
 
 

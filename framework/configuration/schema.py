@@ -201,7 +201,7 @@ def _validation_error(error: ValidationError, path: str, known: Sequence[str]) -
         left = path and fault["input"] is not None and "[" not in where
         return _unknown_key_error(where, str(fault["loc"][-1]), known, bool(left))
     if fault["type"] == "missing":
-        return ConfigError(f"{where} is missing: {fault['msg']}. Give it a value.")
+        return ConfigError(f"{where} is missing: {fault['msg']}. Give this setting a value.")
     hint = ""
     if fault["type"] == "literal_error":
         hint = did_you_mean(str(fault["input"]), re.findall("'([^']*)'", fault.get("ctx", {})["expected"]))
@@ -272,7 +272,9 @@ def _validate(cls: type, values: Mapping[str, Any], path: str, *, nullable: bool
             )
     for key, (annotation, _) in signature(cls).items():
         if key not in values:
-            raise ConfigError(f"{shorten(f'{path}.{key}')} is missing: Field required. Give it a value.")
+            raise ConfigError(
+                f"{shorten(f'{path}.{key}')} is missing: Field required. Give this setting a value."
+            )
         value = values[key]
         if nullable and value is None:
             validated[key] = None
@@ -306,7 +308,7 @@ def _to_plain_values(cls: type, values: Mapping[str, Any], path: str) -> dict[st
             plain_values[key] = _to_plain(value)
         except TypeError as error:
             raise ConfigError(
-                f"{shorten(f'{path}.{key}')} = {quote(value)}: {error}, which a checkpoint cannot store. Annotate the "
+                f"{shorten(f'{path}.{key}')} = {quote(value)}: {error}. Annotate the "
                 f"parameter of {cls.__name__} with numbers, text, paths, enums, or lists, mappings, dataclasses or "
                 "pydantic models of these, and let the constructor build other objects from them."
             ) from None
@@ -368,4 +370,4 @@ def _to_plain(value: Any) -> Any:
         return None
     if is_dataclass(value) and not isinstance(value, type):
         return {field.name: _to_plain(getattr(value, field.name)) for field in fields(value) if field.init}
-    raise TypeError(f"the value contains a {type(value).__name__}")
+    raise TypeError(f"the value contains a {type(value).__name__}, which a checkpoint cannot store")

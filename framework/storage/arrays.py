@@ -29,16 +29,20 @@ def read_npy(content: bytes) -> NDArray:
     stream = io.BytesIO(content)
     version = layout.read_magic(stream)
     if version not in HEADERS:
-        raise ValueError(f"version {version} of the format is not supported; expected version 1.0 or 2.0")
+        raise ValueError(
+            f"version {version} of the .npy format is not supported; expected version 1.0 or 2.0"
+        )
     shape, by_columns, kind = HEADERS[version](stream)
     if kind.kind not in KINDS or not kind.itemsize or any(side < 0 for side in shape):
         raise ValueError(
-            f"got an array of {shorten(kind)} {shorten(shape)}; expected plain numbers or text, no objects"
+            f"got an array of type {shorten(kind)} and shape {shorten(shape)}; expected plain numbers or text, no "
+            "objects"
         )
     count, start = math.prod(shape), stream.tell()  # Python integers cannot overflow
     if count * kind.itemsize > len(content) - start:
         raise ValueError(
-            f"an array of {kind} {shape} takes {count * kind.itemsize} bytes, but only {len(content) - start} follow"
+            f"an array of type {kind} and shape {shape} takes {count * kind.itemsize} bytes, but only "
+            f"{len(content) - start} bytes follow"
         )
     if not count:
         return np.empty(shape, kind)
@@ -77,12 +81,16 @@ def read_npz(content: bytes, names: Collection[str] | None = None) -> dict[str, 
         chosen = {name: part for name, part in parts.items() if names is None or name in names}
         size = sum(part.file_size for part in chosen.values())
         if size > most_decompressed(len(content)):
-            raise ValueError(f"the {len(content)} bytes of the file decompress to {size} bytes")
+            raise ValueError(
+                f"the {len(content)} bytes of the file decompress to {size} bytes, but at most "
+                f"{most_decompressed(len(content))} bytes are allowed"
+            )
         arrays = {}
         for name, part in chosen.items():
             if part.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise ValueError(
-                    f"{shorten(name)} is compressed by the unsupported method {part.compress_type}"
+                    f"the array {shorten(name)} is compressed by the unsupported method {part.compress_type}; save "
+                    "the arrays with numpy.savez or numpy.savez_compressed"
                 )
             with packed.open(part) as stream:
                 # without this size, zipfile would decompress any number of bytes
@@ -90,5 +98,7 @@ def read_npz(content: bytes, names: Collection[str] | None = None) -> dict[str, 
             try:
                 arrays[name] = read_npy(content)
             except ValueError as error:
-                raise ValueError(f"{shorten(name)} cannot be read as plain numbers: {error}") from error
+                raise ValueError(
+                    f"the array {shorten(name)} cannot be read as plain numbers: {error}"
+                ) from error
         return arrays

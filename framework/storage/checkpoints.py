@@ -76,14 +76,16 @@ def read(path: Path) -> dict[str, Any]:
             _require_unfolded(file)
             content = load(file)
             if not isinstance(content, dict):
-                raise ValueError(f"the file contains a {type(content).__name__}, no dict")
+                raise ValueError(f"the file contains a {type(content).__name__}, but a dict is required")
             return content
         except (Foreign, UnpicklingError) as error:
-            content_name = shorten(error) if isinstance(error, Foreign) else "arbitrary pickled objects"
+            foreign_value = (
+                shorten(error) if isinstance(error, Foreign) else "the pickle builds arbitrary objects"
+            )
             raise CheckpointError(
-                f"The checkpoint {path} contains more than dicts, lists, numbers, strings and dense tensors, namely "
-                f"{content_name}, which could run code or exhaust the memory. This framework did not write the file. "
-                "Do not use it."
+                f"The checkpoint {path} contains more than dicts, lists, numbers, strings and dense tensors: "
+                f"{foreign_value}. Other values could run code or exhaust the memory. This framework did not write "
+                "the file. Do not use the file."
             ) from None
         except (
             Exception
@@ -99,7 +101,7 @@ def _require_unfolded(file: BinaryIO) -> None:
         parts = archive.infolist()
         size = os.fstat(file.fileno()).st_size
         if any(part.compress_type for part in parts) or sum(part.file_size for part in parts) > size:
-            raise ValueError("the parts of the archive decompress to more bytes than the file has")
+            raise ValueError("the parts of the zip archive decompress to more bytes than the file has")
 
 
 def verify(path: Path) -> str | None:
@@ -151,9 +153,9 @@ def _fault(file: BinaryIO) -> str | None:
 def _remedy(path: Path) -> str:
     newest = latest_good(path.parent)
     return (
-        f"Use {newest}, the newest undamaged checkpoint in this folder."
+        f"Use {newest}, the newest undamaged checkpoint in the same folder."
         if newest
-        else "This folder contains no undamaged checkpoint. Train the model again."
+        else "The folder of this checkpoint contains no undamaged checkpoint. Train the model again."
     )
 
 
@@ -181,10 +183,9 @@ def _require_plain(partial: Path, path: Path, checkpoint: Mapping[str, Any]) -> 
             require_admitted_pickles(file)
         require_dense(checkpoint, partial.stat().st_size)
     except ValueError as error:
-        content = f"the state contains {shorten(error)}" if isinstance(error, Foreign) else shorten(error)
         raise CheckpointError(
-            f"The checkpoint {path} was not written: {content}, but only dicts, lists, tuples, numbers, strings and "
-            "dense tensors can be read again. Convert other values in `state_dict`."
+            f"The checkpoint {path} was not written: {shorten(error)}. Only dicts, lists, tuples, numbers, strings "
+            "and dense tensors can be read again. Convert other values in `state_dict`."
         ) from None
 
 

@@ -115,7 +115,9 @@ def _pickles(file: BinaryIO) -> Iterator[bytes]:
             for part in archive.infolist()
         }
         if parts != records or len(archive.infolist()) != len(names) or "data.pkl" not in records:
-            raise ValueError("the directory of the archive is ambiguous, or the archive contains no values")
+            raise ValueError(
+                "the directory of the zip archive is ambiguous, or the archive contains no values"
+            )
     yield reader.get_record("data.pkl")
 
 
@@ -137,7 +139,7 @@ def _pickles_before_zip(file: BinaryIO) -> Iterator[bytes]:
         start = file.tell()
         for _, _, place in instructions(file):
             if number == 0 and (place or 0) > LENGTH_OF_MARK:
-                raise ValueError("the file does not begin like a file of torch")
+                raise ValueError("the file does not begin like a file that torch.save writes")
         end = file.tell()
         file.seek(start)
         yield file.read(end - start)
@@ -162,9 +164,9 @@ def require_dense(content: Any, size: int | float = math.inf) -> None:
         if isinstance(item, Tensor):
             bytes_left -= _require_dense(item, name or "a tensor")
             if bytes_left < 0:
-                raise ValueError("the tensors share storage and have far more bytes in all than the file")
+                raise ValueError("the tensors share storage, and have far more bytes in all than the file")
         elif isinstance(item, torch.UntypedStorage | torch.TypedStorage):
-            raise Foreign("a storage without a tensor")
+            raise Foreign("the values contain a storage without a tensor")
         elif isinstance(item, dict | list | tuple | set) and id(item) not in visited:
             visited.add(id(item))
             inner = item.items() if isinstance(item, dict) else enumerate(item)
@@ -174,10 +176,13 @@ def require_dense(content: Any, size: int | float = math.inf) -> None:
 def _require_dense(tensor: Tensor, name: str) -> int:
     """Check one tensor, as `require_dense` does, and return the bytes of its elements."""
     if type(tensor) not in (Tensor, nn.Parameter) or tensor.layout != torch.strided:
-        raise Foreign(f"{shorten(name)}, a {type(tensor).__name__} of layout {tensor.layout}")
+        raise Foreign(
+            f"{shorten(name)} is a {type(tensor).__name__} of layout {tensor.layout}, but only dense tensors are "
+            "allowed"
+        )
     if tensor.dtype not in TYPES or tensor.is_nested or tensor.is_conj() or tensor.is_neg():
         raise Foreign(
-            f"{shorten(name)}, a tensor of type {tensor.dtype} that is not an array of plain numbers"
+            f"{shorten(name)} is a tensor of type {tensor.dtype}, but only arrays of plain numbers are allowed"
         )
     size, stored = tensor.numel() * tensor.element_size(), tensor.untyped_storage().nbytes()
     if size > stored and tensor.numel() > MOST_EXPANDED:

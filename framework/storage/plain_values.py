@@ -45,7 +45,9 @@ def read_json(file: Path, expected: str, remedy: str = RESTORE) -> dict[str, Any
     with translate_errors(file, expected, remedy):
         content = json.loads(decode(_content(file, LARGEST_JSON)))
         if not isinstance(content, dict):
-            raise ValueError(f"the file contains a {type(content).__name__}, no object")
+            raise ValueError(
+                f"the file contains a {type(content).__name__}, but a JSON object ({{...}}) is required"
+            )
         return content
 
 
@@ -63,7 +65,8 @@ def read_yaml(file: Path, expected: str, remedy: str = RESTORE, error: type[User
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > DEEPEST or isinstance(event, yaml.AliasEvent):
                 raise ValueError(
-                    f"the file contains an alias, or values nested more than {DEEPEST} levels deep"
+                    f"the file contains an alias (*name) or values nested more than {DEEPEST} levels deep, which are "
+                    "not allowed"
                 )
         return yaml.load(text, PlainLoader)
 
@@ -178,14 +181,18 @@ def require_plain_pickle(pickled: bytes, called: Collection[str] = (), named: Co
             )
             values = 1 + sum(item.values for item in inner)
             if values > MOST_ITEMS:
-                raise ValueError(f"the pickle contains a tuple of more than {MOST_ITEMS} values")
+                raise ValueError(
+                    f"the pickle contains a tuple of more than {MOST_ITEMS} values, which is not allowed"
+                )
             text = inner[-1].text if inner else ""
             stack.append(_Item(1 + sum(item.size for item in inner), values, text=text))
         elif name == "GLOBAL":
             module, _, word = str(argument).partition(" ")
             global_name = f"{RENAMED.get(module, module)} {word}"
             if global_name not in called and global_name not in named:
-                raise Foreign(shorten(global_name.replace(" ", ".", 1)))
+                raise Foreign(
+                    f"the pickle names {shorten(global_name.replace(' ', '.', 1))}, which is not allowed"
+                )
             stack.append(_Item(name=global_name))
         elif name in ADDS:
             inner = [stack.pop() for _ in range(ADDS[name])] or _above_mark(stack)
@@ -194,17 +201,21 @@ def require_plain_pickle(pickled: bytes, called: Collection[str] = (), named: Co
         elif name in ("REDUCE", "NEWOBJ"):
             arguments, function = stack.pop(), stack.pop()
             if function.name not in called:
-                raise Foreign(f"a call of {function.name or 'an object that is no function'}")
+                raise Foreign(
+                    f"the pickle calls {function.name or 'an object that is no function'}, which is not allowed"
+                )
             if function.name == ENCODE and arguments.text != "latin1":  # some codecs take quadratic time
-                raise Foreign("bytes that pickle did not write")
+                raise Foreign("the pickle builds bytes in a way that Python's pickle module does not use")
             size_left -= arguments.size
             if size_left < 0:
-                raise ValueError("the pickle would build objects that are far larger than the pickle")
+                raise ValueError(
+                    "the pickle would build objects that are far larger than the pickle itself, which is not allowed"
+                )
             stack.append(_Item(arguments.size))
         elif name == "MARK":
             stack.append(_Item(mark=True))
         elif name in OTHERS:
-            raise Foreign(f"the result of the instruction {name}")
+            raise Foreign(f"the pickle contains the instruction {name}, which is not allowed")
         else:
             removed = list(opcode.stack_before)
             if pickletools.markobject in removed:
@@ -222,7 +233,9 @@ def instructions(pickled: Any) -> Iterator[tuple[pickletools.OpcodeInfo, Any, in
     """
     for number, instruction in enumerate(pickletools.genops(pickled)):
         if number == MOST_INSTRUCTIONS:
-            raise ValueError(f"the pickle has more than {MOST_INSTRUCTIONS} instructions")
+            raise ValueError(
+                f"the pickle has more than {MOST_INSTRUCTIONS} instructions, which is not allowed"
+            )
         yield instruction
 
 
@@ -232,7 +245,7 @@ def _above_mark(stack: list[_Item]) -> list[_Item]:
     while not stack[index].mark:
         index -= 1
         if index < 0:
-            raise ValueError("the pickle lacks a mark that one of its instructions needs")
+            raise ValueError("the pickle is damaged: it lacks a mark that one of its instructions needs")
     items = stack[index + 1 :]
     del stack[index:]
     return items

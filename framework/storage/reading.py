@@ -58,7 +58,7 @@ def open_regular(file: Path) -> "Bounded":
     stream = Bounded(io.FileIO(file, "rb", opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)))
     if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
         stream.close()
-        raise OSError("not a regular file")
+        raise OSError("the path is not a regular file")
     return stream
 
 

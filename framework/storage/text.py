@@ -115,7 +115,7 @@ def require_distinct(names: Sequence[str], kind: str = "column") -> None:
     twice = [name for name, count in Counter(names).items() if count > 1 and name]
     if twice:
         raise ValueError(
-            f"names the {kind} {quote(twice[0])} twice, but every name must be unique. Rename one of them."
+            f"the {kind} {quote(twice[0])} is named twice, but every name must be unique. Rename one of them."
         )
 
 

@@ -98,16 +98,19 @@ def _read_torch(path: Path) -> Any:
                 folders = [part.filename for part in archive.infolist() if part.external_attr & 0x10]
                 size = sum(part.file_size for part in archive.infolist())
                 if size > most_decompressed(path.stat().st_size):
-                    raise ValueError(f"the parts of the archive decompress to {size} bytes")
+                    raise ValueError(
+                        f"the parts of the zip archive decompress to {size} bytes, but at most "
+                        f"{most_decompressed(path.stat().st_size)} bytes are allowed"
+                    )
                 failed = archive.testzip() or next(iter(folders), None)
             if failed:
-                raise ValueError(f"the part {failed} of the archive fails its checksum")
+                raise ValueError(f"the part {failed} of the zip archive fails its checksum")
         with open_regular(path) as file:
             return load(file)
     except (Foreign, UnpicklingError) as error:
         raise CheckpointError(
-            f"{path} contains more than plain tensors ({_first_line(error)}), and reading other objects could run "
-            "code. Save the weights again with `torch.save(network.state_dict(), ...)`."
+            f"{path} contains more than plain tensors: {_first_line(error)}. Reading other objects could run code. "
+            "Save the weights again with `torch.save(network.state_dict(), ...)`."
         ) from None
     except Exception as error:  # for damaged bytes, zipfile and torch raise many classes, even AssertionError
         raise _damage_error(path, _first_line(error)) from None
