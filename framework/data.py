@@ -188,7 +188,8 @@ class Data(ABC):
             items = [dataset[index]["input"] for index in range(len(dataset))]  # type: ignore[arg-type]
             if len({item.shape for item in items}) > 1:
                 raise DataError(
-                    "The files hold inputs of different sizes, which form no batch. Give the files one by one."
+                    "The files hold inputs of different sizes, but a batch needs inputs of one size. Give the files "
+                    "one by one."
                 )
             return torch.stack(items)
         return as_inputs(user_data, self.input_shape)
@@ -297,7 +298,7 @@ def as_inputs(user_data: Any, shape: tuple[int, ...]) -> Tensor:
     except (TypeError, ValueError) as error:
         raise DataError(
             f"Got an object of type {type(user_data).__name__}, but the model reads files or an array of inputs of "
-            f"shape {expected_shape}."
+            f"shape {expected_shape}. Give one of these."
         ) from error
     if inputs.is_complex():
         raise DataError(

@@ -43,7 +43,7 @@ def test_an_empty_cell_in_a_table_of_one_column_is_a_row(tmp_path: Path) -> None
         ("a,b\n,\n\n", "has no row below its first line"),
         ("a b\n1 2\n3 4", r"is separated by blanks: its first line is 'a b'. Commas"),
         ("1,2\n3,4", r"line 1: '1, 2' are numbers, but the first line must name the columns"),
-        ("a,b,a\n1,2,3", "names the column 'a' twice"),
+        ("a,b,a\n1,2,3", "the column 'a' is named twice"),
         (",a\nx,1", r"column 1 has no name, but holds 'x', which is no row number"),
         (
             "a,b\n1,5,2\n",

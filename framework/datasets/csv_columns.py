@@ -294,7 +294,7 @@ def read_columns(
             names = next(reader, [])
         if len(names) > MOST_COLUMNS:
             raise DataError(
-                f"{file} has {len(names)} columns, but at most {MOST_COLUMNS} are allowed. Leave some out."
+                f"{file} has {len(names)} columns, but at most {MOST_COLUMNS} are allowed. Leave some columns out."
             )
         header = [text.column_name(cell) for cell in names]
         _check_header(file, header)
@@ -398,7 +398,8 @@ def tables(
     """
     if not files:
         raise DataError(
-            f"No file was given, but at least one CSV table with the columns {', '.join(names)} is required."
+            f"No file was given, but at least one CSV table with the columns {', '.join(names)} is required. Give "
+            "such a file."
         )
     for file in files:
         columns = read_columns(Path(file), writing)
@@ -485,7 +486,7 @@ def _why_no_numbers(columns: Columns, name: str, setting: str) -> str:
         cell, line, mend = next(clear, readable[0])
         raise DataError(
             f"{columns.file} line {line}, column {quote(name)}: {quote(cell)} is a number {mend.form}. "
-            f"{remedy(mend, columns.writing)} Or list the columns to read in {setting}, without this one."
+            f"{remedy(mend, columns.writing)} Or list the columns to read in {setting}, and leave this column out."
         )
     return f"words; {plain / len(filled):.0%} of the cells are numbers" if plain else "words"
 
@@ -635,7 +636,7 @@ def _check_header(file: Path, header: Sequence[str]) -> None:
     try:
         text.require_distinct(header)
     except ValueError as error:
-        raise DataError(f"{file} {error}") from None
+        raise DataError(f"{file}: {error}") from None
 
 
 def _check_blanks(file: Path, header: Sequence[str], columns: Sequence[Sequence[str]]) -> None:

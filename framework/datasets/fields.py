@@ -22,7 +22,10 @@ class Fields(Dataset[dict[str, Tensor]]):
     def __init__(self, **fields: Tensor) -> None:
         lengths = {name: len(tensor) for name, tensor in fields.items()}
         if len(set(lengths.values())) != 1:
-            raise ValueError(f"The fields have the lengths {lengths}, but all must have the same length.")
+            raise ValueError(
+                f"The fields have the lengths {lengths}, but all must have the same length. Give every field one row "
+                "for each sample."
+            )
         self.fields = fields
         self.length = next(iter(lengths.values()))
 

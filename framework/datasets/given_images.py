@@ -49,7 +49,7 @@ def to_inputs(data: Data, images: Any) -> Tensor:
     if inputs.is_floating_point() and inputs.numel() and not (inputs.amin() >= 0 and inputs.amax() <= 1):
         raise DataError(
             f"Got floating-point images with values from {inputs.amin():.4g} to {inputs.amax():.4g}. Expected values "
-            "from 0 to 1, or uint8."
+            "from 0 to 1, or uint8. Scale the values, or convert them to uint8."
         )
     return inputs
 
@@ -59,7 +59,7 @@ def _whole(image: Image.Image, shape: tuple[int, ...]) -> UInt8[Tensor, "channel
     try:
         decoded = decode(image, shape[0], upright=True)
     except DataError as error:
-        raise DataError(f"An image of mode {image.mode}: {error}") from error
+        raise DataError(f"An image of mode {image.mode} cannot be read: {error}") from error
     except Exception as error:  # Pillow reads the file only at this point
         why = shorten(error) or type(error).__name__
         raise DataError(
@@ -68,6 +68,7 @@ def _whole(image: Image.Image, shape: tuple[int, ...]) -> UInt8[Tensor, "channel
     pixels = cut_square(decoded, (0.0, 0.0, float(decoded.width), float(decoded.height)), 0.0, shape[1])
     if pixels is None:
         raise DataError(
-            f"Got an image of {image.width} × {image.height} pixels, but at least 1 × 1 is required."
+            f"Got an image of {image.width} × {image.height} pixels, but at least 1 × 1 is required. Leave this "
+            "image out."
         )
     return torch.from_numpy(pixels)

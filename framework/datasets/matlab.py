@@ -58,10 +58,12 @@ def parse_variables(content: bytes, names: Sequence[str] | None = None) -> dict[
     """
     order = {b"IM": "<", b"MI": ">"}.get(content[126:HEADER_BYTES])
     if order is None:
-        raise ValueError("the file has no header of a MATLAB 5 file")
+        raise ValueError("the file does not begin with the header of a MATLAB 5 file")
     (version,) = struct.unpack_from(f"{order}H", content, 124)
     if version != 0x0100:
-        raise ValueError(f"the format version is {version:#06x} instead of 0x0100")
+        raise ValueError(
+            f"the header states format version {version:#06x}, but 0x0100 (MATLAB 5) is required"
+        )
     reader, result = _Reader(order), {}
     position, remaining = HEADER_BYTES, most_decompressed(len(content))
     while position < len(content):
@@ -77,7 +79,9 @@ def parse_variables(content: bytes, names: Sequence[str] | None = None) -> dict[
                 remaining -= len(element)
             kind, start, end = reader.element(element, 0, len(element))
             if kind != MATRIX:
-                raise ValueError(f"a variable is stored as an element of type {kind} instead of {MATRIX}")
+                raise ValueError(
+                    f"a variable is stored as data of type {kind}, but type {MATRIX} (an array) is required"
+                )
             result[name] = reader.array(element, start, end, 0)
     return result
 
@@ -105,16 +109,21 @@ class _Reader:
         Data that end after `limit` raise a ValueError.
         """
         if position + 8 > limit:
-            raise ValueError(f"the file ends within an element at byte {position}")
+            raise ValueError(
+                f"the file is cut short: it ends within the data element that begins at byte {position}"
+            )
         kind, size = struct.unpack_from(f"{self.order}II", content, position)
         start = position + 8
         if kind >> 16:  # small element: at most four bytes of data, in the second half of the tag
             kind, size, start = kind & 0xFFFF, kind >> 16, position + 4
             if size > 4:
-                raise ValueError(f"a small element at byte {position} has {size} bytes instead of at most 4")
+                raise ValueError(
+                    f"a small data element at byte {position} has {size} bytes, but at most 4 are allowed"
+                )
         if start + size > limit:
             raise ValueError(
-                f"an element of {size} bytes at byte {position} extends beyond the element that contains it"
+                f"a data element of {size} bytes at byte {position} extends beyond the end of the file, or of the "
+                "array that contains it"
             )
         return kind, start, start + size
 
@@ -122,7 +131,7 @@ class _Reader:
         """Read flags, dimensions and name of the array that begins at `start`."""
         kind, first, last = self.element(content, start, end)
         if kind != UNSIGNED or last - first != 8:
-            raise ValueError(f"the array at byte {start} has no flags")
+            raise ValueError(f"the array at byte {start} does not begin with 8 bytes of flags")
         (flags,) = struct.unpack_from(f"{self.order}I", content, first)
         if flags & 0xFF == OPAQUE:
             return _Head(OPAQUE, False, (), "", end)
@@ -131,7 +140,7 @@ class _Reader:
         shape = tuple(map(int, sides))
         if not 2 <= len(shape) <= 32 or min(shape) < 0:
             raise ValueError(
-                f"an array has the dimensions {shape}; 2 to 32 dimensions, none negative, are allowed"
+                f"an array has the dimensions {shape}; expected 2 to 32 dimensions, none of them negative"
             )
         name = content[first:last].decode("latin-1")
         return _Head(flags & 0xFF, bool(flags & COMPLEX), shape, name, _align(last))
@@ -140,7 +149,7 @@ class _Reader:
         """Return the numbers of the element at `position`, and the position of the next element."""
         kind, start, end = self.element(content, position, limit)
         if kind not in NUMBERS:
-            raise ValueError(f"the element at byte {position} has type {kind} instead of numbers")
+            raise ValueError(f"the data element at byte {position} has type {kind}, but numbers are required")
         return np.frombuffer(content[start:end], self.order + NUMBERS[kind]), _align(end)
 
     def array(self, content: bytes, start: int, end: int, depth: int) -> Any:
@@ -149,7 +158,9 @@ class _Reader:
             return np.empty(0)
         head = self.head(content, start, end)
         if head.complex:
-            raise ValueError(f"the array at byte {start} holds complex numbers, which are not supported")
+            raise ValueError(
+                f"the array at byte {start} holds complex numbers, but only real numbers are supported"
+            )
         count, position = math.prod(head.shape), head.position
         if head.kind in NUMERIC:
             values, _ = self.numbers(content, position, end)
@@ -172,7 +183,7 @@ class _Reader:
                     kind, first, last = self.element(content, position, end)
                     if kind != MATRIX:
                         raise ValueError(
-                            f"the element at byte {position} has type {kind} instead of an array"
+                            f"the data element at byte {position} has type {kind}, but an array is required"
                         )
                     entry[field] = self.array(content, first, last, depth + 1)
                     position = _align(last)
@@ -189,7 +200,8 @@ class _Reader:
         kind, start, end = self.element(content, position, limit)
         if kind not in LETTERS or len(shape) != 2:
             raise ValueError(
-                f"the text at byte {position} has type {kind} and shape {shape}, which is not supported"
+                f"the text at byte {position} has type {kind} and shape {shape}; expected characters in two "
+                "dimensions"
             )
         wide = {"<": "-le", ">": "-be"}[self.order] if LETTERS[kind] in ("utf-16", "utf-32") else ""
         letters = content[start:end].decode(LETTERS[kind] + wide)
@@ -197,7 +209,9 @@ class _Reader:
         if rows < 2 or not columns:
             return letters.rstrip("\0")
         if len(letters) != rows * columns:
-            raise ValueError(f"a text of shape {shape} has {len(letters)} characters")
+            raise ValueError(
+                f"a text of shape {shape} has {len(letters)} characters; expected {rows * columns}"
+            )
         return np.array([letters[row::rows] for row in range(rows)])
 
     def fields(self, content: bytes, position: int, limit: int) -> tuple[list[str], int]:
@@ -206,7 +220,10 @@ class _Reader:
         _, start, end = self.element(content, position, limit)
         length = int(lengths[0]) if len(lengths) == 1 else 0
         if length < 1 or (end - start) % length:
-            raise ValueError(f"the field names at byte {start} do not have one common length")
+            raise ValueError(
+                f"the field names at byte {start} have different lengths; expected one length that divides their "
+                f"{end - start} bytes"
+            )
         names = content[start:end].decode("latin-1")
         parts = [names[first : first + length] for first in range(0, len(names), length)]
         return [part.partition("\0")[0] for part in parts], _align(end)

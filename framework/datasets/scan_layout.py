@@ -120,14 +120,17 @@ def read_splits(root: Path) -> dict[str, tuple[str, ...]]:
         with translate_errors(file, "names of subjects, a line each"):
             names = [line.strip() for line in lines_of(read_bytes(file)) if line.strip()]
             if not names:
-                raise ValueError("the list names nobody")
+                raise ValueError("the list is empty; expected one name of a subject in each line")
             for name in names:
                 if not NAME.fullmatch(name):
-                    raise ValueError(f"{shorten(name)!r} is no name of a folder in {root / 'subjects'}")
+                    raise ValueError(
+                        f"{shorten(name)!r} cannot be the name of a folder in {root / 'subjects'}; expected a name "
+                        "of letters, digits and ._- that begins with a letter or digit"
+                    )
                 if name in list_of_subject:
                     raise ValueError(
-                        f"subject {name} is in {list_of_subject[name].name} already; expected each subject once, in "
-                        "one split"
+                        f"subject {name} is already listed in {list_of_subject[name].name}; expected each subject "
+                        "once, in one split"
                     )
                 list_of_subject[name] = file
         names_by_split[split] = tuple(names)
@@ -204,13 +207,18 @@ def read_cameras(file: Path) -> dict[str, Camera]:
     with translate_errors(file, "cameras"):
         views = document.get("views")
         if not isinstance(views, list) or not views:
-            raise ValueError('expected {"views": [...]} with one camera or more')
+            raise ValueError(
+                'the key "views" lists no camera; expected {"views": [...]} with one camera or more'
+            )
         for number, view in enumerate(views):
             name = view.get("name") if isinstance(view, dict) else None
             if not isinstance(name, str) or not NAME.fullmatch(name):
-                raise ValueError(f"view {number} (from 0) has no name that can be a file name")
+                raise ValueError(
+                    f"view {number} (from 0) has no name that can be a file name; expected a different name for each "
+                    "view"
+                )
             if name in cameras:
-                raise ValueError(f"view {name} occurs twice")
+                raise ValueError(f"view {name} occurs twice; expected a different name for each view")
             cameras[name] = _camera(name, view)
     return cameras
 
@@ -218,7 +226,10 @@ def read_cameras(file: Path) -> dict[str, Camera]:
 def _camera(name: str, view: Mapping[str, Any]) -> Camera:
     sizes = [view.get(side) for side in ("height", "width")]
     if not all(type(size) is int and 1 <= size <= images.LONGEST_SIDE for size in sizes):
-        raise ValueError(f"view {name}: height and width are {sizes}; expected whole numbers of pixels")
+        raise ValueError(
+            f"view {name}: height and width are {sizes}; expected whole numbers of pixels from 1 to "
+            f"{images.LONGEST_SIDE}"
+        )
     numbers = {}
     for key, shape in (("K", (3, 3)), ("R", (3, 3)), ("t", (3,))):
         try:
@@ -226,7 +237,10 @@ def _camera(name: str, view: Mapping[str, Any]) -> Camera:
         except (OverflowError, TypeError, ValueError):
             numbers[key] = np.empty(0)
         if numbers[key].shape != shape or not np.isfinite(numbers[key]).all():
-            raise ValueError(f"view {name}: {key} is no array of {'×'.join(map(str, shape))} finite numbers")
+            raise ValueError(
+                f"view {name}: {key} has the wrong shape or content; expected {'×'.join(map(str, shape))} finite "
+                "numbers"
+            )
     matrix, rotation, translation = (numbers[key] for key in ("K", "R", "t"))
     deviation = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if not deviation < SLACK or np.linalg.det(rotation) < 0:
@@ -242,7 +256,7 @@ def _camera(name: str, view: Mapping[str, Any]) -> Camera:
     ):
         raise ValueError(
             f"view {name}: the camera matrix K is {matrix.tolist()}; expected ((fx, 0, cx), (0, fy, cy), (0, 0, 1)) "
-            "with fx and fy above 0: pixels without shear"
+            "in pixels, with fx and fy above 0 and without shear"
         )
     height, width = (int(size) for size in sizes if size is not None)
     return Camera(
@@ -275,8 +289,8 @@ def tail(file: Path) -> bytes:
 def _check_size(file: Path, image: Image.Image, camera: Camera) -> None:
     if image.size != (camera.width, camera.height):
         raise DataError(
-            f"{file}: {image.width} × {image.height} pixels, but its camera has {camera.width} × {camera.height}; "
-            "expected the same size. Correct cameras.json, or scale the image."
+            f"{file}: the image has {image.width} × {image.height} pixels, but its camera has {camera.width} × "
+            f"{camera.height}; expected the same size. Correct cameras.json, or scale the image."
         )
 
 
@@ -313,7 +327,11 @@ def read_places(root: Path, topology: str) -> TexturePlaces:
         ] == (2,)
         fits = fits and np.isfinite(places.uv).all()
         if not fits or places.uv_faces.min() < 0 or places.uv_faces.max() >= len(places.uv):
-            raise ValueError("the array uv_faces does not fit faces and uv")
+            raise ValueError(
+                f"the shapes are faces {places.faces.shape}, uv_faces {places.uv_faces.shape} and uv "
+                f"{places.uv.shape}; expected (faces, 3) twice, finite uv (coordinates, 2), and row numbers of uv in "
+                "uv_faces"
+            )
     return places
 
 
@@ -348,7 +366,10 @@ def write_cameras(file: Path, cameras: Mapping[str, Camera]) -> None:
             }
         )
     if not all(math.isfinite(number) for view in views for row in view["K"] for number in row):
-        raise ValueError("a camera has numbers that are not finite; expected finite numbers.")
+        raise ValueError(
+            "the matrix K of a camera has numbers that are not finite; expected finite numbers. Correct the focal "
+            "length or the principal point."
+        )
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps({"views": views}, indent=1) + "\n", encoding="utf-8")
 

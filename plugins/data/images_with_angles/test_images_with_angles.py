@@ -94,7 +94,7 @@ def table_with(line: str, header: str = "file,pan,tilt", index: int = 3) -> str:
         ("files,pan\n000.png,3", r"has no column `file`\. Did you mean 'files'\?"),
         ("file,pan\n000.png,3;4", r"no column of numbers .* 'pan': words"),
         ("file,pan", r"no row below its first line, but one row per sample is expected"),
-        ("file,pan,pan\n000.png,3,4", r"names the column 'pan' twice"),
+        ("file,pan,pan\n000.png,3,4", r"the column 'pan' is named twice"),
         ("file,note\n000.png,hello", r"has no column of numbers besides `file` and `split`"),
         (table_with("777.png,abc,4"), r"line 5, column 'pan': 'abc' is no finite number"),
         (table_with("777.png,,4"), r"line 5, column 'pan': '' is no finite number"),

@@ -146,7 +146,7 @@ def with_cell(cell: str, line: int = 5, column: int = 0) -> str:
         ("", "mine.csv is empty"),
         ("x,class", "has no row below its first line"),
         ("x class\n1 2", "is separated by blanks"),
-        ("x,x,class\n1,2,a", "names the column 'x' twice"),
+        ("x,x,class\n1,2,a", "the column 'x' is named twice"),
         (
             "x,klass\n1,a",
             r"data\.target names the column 'class', which .*mine\.csv does not have\. Did you mean 'klass'\?",
