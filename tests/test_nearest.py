@@ -246,7 +246,7 @@ def test_a_bad_number_is_named_whichever_thread_reads_it(place):
     cloud[0, place, 2] = torch.nan
     try:
         torch.set_num_threads(3)
-        with pytest.raises(DataError, match=rf"point {place} of number 0"):
+        with pytest.raises(DataError, match=rf"point {place} of entry 0"):
             nearest(cloud, torch.rand(1000, 3))
     finally:
         torch.set_num_threads(THREADS)
@@ -289,18 +289,21 @@ assert not config.CACHE_DIR
 
 
 BAD = [
-    ({"clouds": torch.full((2, 4, 3), math.nan)}, r"clouds: point 0 of number 0 .* \[nan, nan, nan\]"),
-    ({"clouds": torch.zeros(2, 4, 3).index_fill(1, torch.tensor(2), math.inf)}, "point 2 of number 0"),
+    ({"clouds": torch.full((2, 4, 3), math.nan)}, r"clouds: point 0 of entry 0 .* \[nan, nan, nan\]"),
+    ({"clouds": torch.zeros(2, 4, 3).index_fill(1, torch.tensor(2), math.inf)}, "point 2 of entry 0"),
     ({"queries": torch.tensor([[0, 0, math.inf]])}, "queries: point 0"),
-    ({"queries": torch.full((2, 3, 3), math.nan)}, "queries: point 0 of number 0"),
+    ({"queries": torch.full((2, 3, 3), math.nan)}, "queries: point 0 of entry 0"),
     ({"clouds": torch.zeros(2, 0, 3)}, "hold no point"),
     ({"queries": torch.zeros(0, 3)}, "hold no point"),
     ({"clouds": torch.zeros(2, 4, 6)}, "first three columns"),
     ({"clouds": torch.zeros(2, 4, 3).half()}, r"float16; .* \.float\(\)"),
     ({"queries": torch.zeros(3, 3).double()}, "same type and device"),
     ({"queries": torch.zeros(3, 2, 3)}, "as many sets of queries as clouds"),
-    ({"sizes": torch.tensor([0, 4])}, "number 0 has the size 0; expected a size from 1 to 4"),
-    ({"sizes": torch.tensor([4, 5])}, "number 1 has the size 5"),
+    (
+        {"sizes": torch.tensor([0, 4])},
+        "entry 0 has the size 0; expected one size for each entry, from 1 to 4",
+    ),
+    ({"sizes": torch.tensor([4, 5])}, "entry 1 has the size 5"),
     ({"sizes": torch.tensor([4])}, "there are 1 sizes"),
     ({"query_sizes": torch.tensor([1, 1])}, "Leave query_sizes out"),
 ]

@@ -348,11 +348,11 @@ def stl(content: bytes) -> Parsed:
         fault = (
             "the file is cut short, or is no STL file"
             if announced_faces < 0 or rest < 0
-            else f"{rest} bytes follow"
+            else f"{rest} unexpected bytes follow the faces"
         )
         raise ValueError(
             f"the file has {len(content)} bytes and announces {max(announced_faces, 0)} faces, which take "
-            f"{max(announced_bytes, 84)}; {fault}"
+            f"{max(announced_bytes, 84)} bytes; {fault}"
         )
     return Parsed(corners, np.arange(len(corners)).reshape(-1, 3))
 
@@ -374,8 +374,9 @@ def _stl_text(content: bytes) -> Float[np.ndarray, "corners 3"]:
     solids, closed = keys.count(b"solid"), keys.count(b"endsolid")
     if opened != ended or len(corners) != 3 * opened or solids != closed:
         raise ValueError(
-            f"{opened} facets are opened, {ended} ended, with {len(corners)} corners; {solids} solids are opened, "
-            f"{closed} ended; expected 3 corners a facet, and an end of each; the file is cut short"
+            f"the file has {opened} facets with {len(corners)} corners, {ended} ends of facets, {solids} solids and "
+            f"{closed} ends of solids; expected 3 corners for each facet, and as many ends as beginnings; the file "
+            "is cut short"
         )
     return corners
 

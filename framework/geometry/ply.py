@@ -86,13 +86,18 @@ def ply(content: bytes) -> Parsed:
     last = rb"\r" if re.match(rb"ply[ \t]*\r(?!\n)", content) else rb"\r?\n"
     end = re.search(rb"(?:^|[\r\n])end_header[ \t]*" + last, content)
     if not content.startswith(b"ply") or end is None:
-        raise ValueError("expected ply in the first line and a line end_header")
+        raise ValueError(
+            "the file lacks the word ply at its beginning, or the line end_header that ends a PLY header"
+        )
     order, elements = _header(content[: end.start()])
     names = {element.name for element in elements}
     if "tristrips" in names:
         raise ValueError("the faces are strips of triangles; save the mesh with single faces")
     if "vertex" not in names:
-        raise ValueError(f"expected an element vertex, got {shorten(', '.join(sorted(names))) or 'none'}")
+        raise ValueError(
+            f"the header lists the elements {shorten(', '.join(sorted(names))) or 'none'}; expected an element named "
+            "vertex"
+        )
     body = content[end.end() :]
     for element in elements:
         text.require_distinct(column_names([entry.name for entry in element.properties]), "property")
@@ -110,7 +115,10 @@ def _header(content: bytes) -> tuple[str, list[Element]]:
     # lines of bytes, since lines of text also end at other characters, such as the last byte of Å
     for line in content.splitlines()[1:]:
         if max(len(elements), len(elements[-1].properties) if elements else 0) > MOST_COLUMNS:
-            raise ValueError(f"the header has more than {MOST_COLUMNS} elements, or properties of one")
+            raise ValueError(
+                f"the header has more than {MOST_COLUMNS} elements, or an element with more than {MOST_COLUMNS} "
+                "properties"
+            )
         words = [word.decode("utf-8", "replace") for word in line.split()]
         if not words or words[0] in ("comment", "obj_info"):
             continue
@@ -135,10 +143,10 @@ def _header(content: bytes) -> tuple[str, list[Element]]:
         except (KeyError, IndexError, ValueError):
             header_line = quote(line.decode("utf-8", "replace").strip())
             raise ValueError(
-                f"the header has the line {header_line}, which is no line of a PLY header"
+                f"expected a line of a PLY header (format, element, property, comment or obj_info), got {header_line}"
             ) from None
     if order is None:
-        raise ValueError("the header has no line format")
+        raise ValueError("the header lacks a line that begins with the word format")
     return order, elements
 
 
@@ -155,7 +163,9 @@ def _text(body: bytes, elements: list[Element], place: Place, before: int) -> tu
     lines = text_lines(body, None)
     announced_lines = sum(element.count for element in elements if element.properties)
     if len(lines) != announced_lines:
-        raise ValueError(f"the header announces {announced_lines} lines of data, but {len(lines)} follow")
+        raise ValueError(
+            f"the header announces {announced_lines} lines of data, but {len(lines)} lines follow"
+        )
     vertices, faces = np.empty((0, 3)), np.empty((0, 3), np.int64)
     for element in elements:
         first = announced_lines - len(lines)
@@ -170,7 +180,8 @@ def _text(body: bytes, elements: list[Element], place: Place, before: int) -> tu
         elif element.name == "face" and own:
             if not _corners(element) == element.properties[0]:
                 raise ValueError(
-                    "in a text file the faces must begin with their corners; save the file as binary"
+                    "the list of corners is not the first property of the faces, as it must be in a text file; save "
+                    "the mesh as binary PLY"
                 )
             faces = polygons(own, where)
     return vertices, faces
@@ -192,7 +203,9 @@ def _binary(body: bytes, elements: list[Element], order: str) -> tuple[NDArray, 
             triangles, start = _lists(body, start, element, order)
             faces = triangles if element.name == "face" else faces
     if start > len(body) or not has_only_padding(body, start):
-        raise ValueError(f"{len(body) - start} bytes follow after the data that the header announces")
+        raise ValueError(
+            f"{len(body) - start} bytes follow after the data that the header announces; expected the end of the file"
+        )
     return vertices, faces
 
 
@@ -268,7 +281,9 @@ def _locate_lists(
                 (count,) = length.unpack_from(body, start)
                 start += length.size
                 if count < 0:
-                    raise ValueError(f"a list of an element {shorten(element.name)} has {count} values")
+                    raise ValueError(
+                        f"a list of the element {shorten(element.name)} has {count} values; expected 0 or more"
+                    )
             if chosen:
                 counts[item], places[item] = count, start
             start += count * width
@@ -307,7 +322,7 @@ def _corners(element: Element) -> Property:
     for entry in element.properties:
         if entry.name in CORNERS and entry.length is not None:
             return entry
-    raise ValueError(f"the faces have no list {' or '.join(CORNERS)}")
+    raise ValueError(f"the faces have no list of their corners; expected a list named {' or '.join(CORNERS)}")
 
 
 def _refuse_lists(element: Element) -> None:
@@ -321,7 +336,8 @@ def _to_parsed(vertex: Element, values: NDArray, faces: NDArray) -> Parsed:
     missing = [name for name in XYZ if name not in names]
     if missing:
         raise ValueError(
-            f"the vertices have no {', '.join(missing)}, only {shorten(', '.join(names)) or 'nothing'}"
+            f"the vertices have no properties {', '.join(missing)}, only {shorten(', '.join(names)) or 'none'}; "
+            "expected x, y and z"
         )
     if not len(values):
         values = np.empty((0, len(names)))

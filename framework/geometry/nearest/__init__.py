@@ -162,7 +162,10 @@ def require_points(points: Tensor, name: str) -> None:
             "float32 or float64. Take the first three columns and call .float()."
         )
     if points.shape[1] == 0:
-        raise DataError(f"{name} of shape {tuple(points.shape)} hold no point; expected at least one.")
+        raise DataError(
+            f"{name} of shape {tuple(points.shape)} hold no point; expected at least one point. Leave out empty "
+            "entries."
+        )
 
 
 def require_sizes(points: Tensor, sizes: Tensor | None, name: str) -> Tensor | None:
@@ -185,13 +188,13 @@ def require_sizes(points: Tensor, sizes: Tensor | None, name: str) -> Tensor | N
     wrong = ((sizes < 1) | (sizes > points.shape[1])).nonzero()
     if len(sizes) != len(points) or len(wrong):
         fault = (
-            f"number {int(wrong[0])} has the size {int(sizes[wrong[0]])}"
+            f"entry {int(wrong[0])} has the size {int(sizes[wrong[0]])}"
             if len(wrong)
             else f"there are {len(sizes)} sizes"
         )
         raise DataError(
-            f"Of {len(points)} {name} of up to {points.shape[1]} points, {fault}; expected a size from 1 to "
-            f"{points.shape[1]} for each. Leave out empty ones."
+            f"Got sizes for a batch of {len(points)} {name} with up to {points.shape[1]} points, but {fault}; "
+            f"expected one size for each entry, from 1 to {points.shape[1]}. Leave out empty entries."
         )
     return sizes
 
@@ -213,7 +216,7 @@ def refuse_bad(points: Tensor, sizes: Tensor | None, name: str) -> None:
     if bad.any():
         cloud, point = bad.nonzero()[0].tolist()
         raise DataError(
-            f"{name}: point {point} of number {cloud} of the batch is {points[cloud, point].tolist()}; expected "
+            f"{name}: point {point} of entry {cloud} of the batch is {points[cloud, point].tolist()}; expected "
             "finite coordinates. Correct the file, remove such points, or give `sizes` so that padding is not read."
         )
 

@@ -101,7 +101,7 @@ class Stream:
         """
         if self.best is None:
             raise DataError(
-                "A stream of chunks held no point; expected at least one. Leave out empty clouds."
+                "The chunks of a cloud held no point; expected at least one point. Leave out empty clouds."
             )
         return Streamed(*(tensor.clone() for tensor in self.best))
 
