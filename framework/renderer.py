@@ -93,7 +93,7 @@ def join_scenes(scenes: Sequence[Scene]) -> Scene:
             `smooth`.
     """
     if not scenes:
-        raise ValueError("Got no scene to join; expected at least one.")
+        raise ValueError("Got no scene to join; expected at least one scene. Give a scene.")
     paints = [scene.colors for scene in scenes if scene.colors is not None]
     paints += [image for scene in scenes if scene.texture is not None for image in scene.texture.images]
     if len({paint.shape[-1] for paint in paints}) > 1:
@@ -130,8 +130,8 @@ def _join_textures(scenes: Sequence[Scene]) -> Texture | None:
         return None
     if len({(texture.wrap, texture.smooth) for texture in textures}) > 1:
         raise ValueError(
-            "The textures have different wrap or smooth, but one scene has only one value of each. Draw the scenes "
-            "separately, or change a texture."
+            "The textures of the scenes differ in `wrap` or `smooth`, but the joined scene has only one value of "
+            "each. Draw the scenes separately, or give all textures the same values."
         )
     images: list[Tensor] = []
     places, faces, shown = [], [], []

@@ -123,5 +123,5 @@ def test_classes_are_enumerated():
 def test_refuses_what_does_not_fit():
     with pytest.raises(ValueError, match="expected equal shapes"):
         Stacked([density("real", 3), density("real", 4)])
-    with pytest.raises(ValueError, match="the same number of items"):
+    with pytest.raises(ValueError, match="the same number of densities"):
         Reshaped(density("real", 6), (4, 2))

@@ -28,8 +28,8 @@ def nonempty_batches(batches: Iterable[Batch], by: str) -> list[Batch]:
     nonempty = [batch for batch in batches if len(batch["target"])]
     if not nonempty:
         raise UserError(
-            f"{by} is calibrated on the validation split, but got no sample of it. Give the data set one "
-            f"(its README says how), or leave {by} out."
+            f"{by} is calibrated on the validation split, but this split is empty. Give the data set a validation "
+            f"split (the README of the data set says how), or leave {by} out."
         )
     return nonempty
 

@@ -152,8 +152,8 @@ class Frozen:
         array = inputs.detach().numpy() if isinstance(inputs, Tensor) else inputs
         if array.shape[1:] != self.shape:
             raise ValueError(
-                f"Got inputs of shape {tuple(array.shape)}, but shape (batch, {', '.join(map(str, self.shape))}) "
-                "is required."
+                f"Got inputs of shape {tuple(array.shape)}, but shape (batch, {', '.join(map(str, self.shape))}) is "
+                "required. Reshape the inputs."
             )
         flat = array.reshape(len(array), math.prod(self.shape))
         return np.ascontiguousarray(flat, dtype=network.dtype), network, frame

@@ -28,8 +28,8 @@ class AffineDensity(Distribution):
         shape = density.batch_shape + density.event_shape
         if len(density.event_shape) != 1 or location.shape != shape or scale.shape != shape:
             raise ValueError(
-                f"location {tuple(location.shape)} and scale {tuple(scale.shape)} do not fit a density over "
-                f"{tuple(shape)}; expected the same shape (*batch, number) for all three."
+                f"The location has the shape {tuple(location.shape)} and the scale {tuple(scale.shape)}, but the "
+                f"density is over {tuple(shape)}; expected the same shape (*batch, number) for all three."
             )
         self.density = density
         self.location = location

@@ -29,8 +29,8 @@ class Stacked(Distribution):
         shapes = [(tuple(density.batch_shape), tuple(density.event_shape)) for density in densities]
         if any(shape != shapes[0] for shape in shapes):
             raise ValueError(
-                f"The densities have different (batch_shape, event_shape): {sorted(set(shapes))}; expected equal "
-                "shapes."
+                f"The densities to be stacked have different (batch_shape, event_shape): {sorted(set(shapes))}; "
+                "expected equal shapes. Stack only densities of the same target."
             )
         self.densities = tuple(densities)
         self.has_enumerate_support = first.has_enumerate_support
@@ -100,8 +100,8 @@ class Reshaped(Distribution):
         # a size that is not known yet, as in the trace of an exported model, must not be compared
         if not torch.compiler.is_exporting() and shape.numel() != density.batch_shape.numel():
             raise ValueError(
-                f"A batch of shape {tuple(density.batch_shape)} cannot be read as {tuple(shape)}; expected the same "
-                "number of items."
+                f"A batch of densities with batch_shape {tuple(density.batch_shape)} cannot get the batch_shape "
+                f"{tuple(shape)}; expected the same number of densities."
             )
         self.density = density
         self.has_enumerate_support = density.has_enumerate_support

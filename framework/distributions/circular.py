@@ -67,7 +67,9 @@ def circular_median(samples: Float[Tensor, "samples *batch"]) -> Float[Tensor, "
     """
     count = samples.shape[0]
     if count == 0:
-        raise ValueError("circular_median got no sample, but requires at least one sample.")
+        raise ValueError(
+            "circular_median got no sample, but requires at least one sample. Draw more samples."
+        )
     # float64: prefix sums over many samples cancel in float32
     angle = wrap(samples.double()).movedim(0, -1).contiguous()
     angle, _ = angle.sort(-1)

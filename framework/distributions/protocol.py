@@ -175,7 +175,10 @@ def tempered_density(density: Distribution, temperature: Tensor) -> Distribution
     Raises:
         UserError: any other density that has not registered its power, or a power too narrow for the finest grid.
     """
-    raise TypeError(f"{type(density).__name__} is no torch.distributions.Distribution.")
+    raise TypeError(
+        f"Got an object of type {type(density).__name__}; expected a torch.distributions.Distribution. Return such a "
+        "density from the density head."
+    )
 
 
 class Estimate(NamedTuple):

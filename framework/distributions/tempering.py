@@ -235,8 +235,9 @@ class CircularPower(Distribution):
             return off
         if self.points == MOST_POINTS:
             _log.warning(
-                "%d of %d densities (%s) have a mass between %.3g and %.3g on a grid of %d angles, not 1: either "
-                "log_prob is not normalised, or the density has a narrower peak, which its power then lacks.",
+                "%d of %d densities (%s) have a mass between %.3g and %.3g on a grid of %d angles, not 1. Either "
+                "log_prob is not normalised, or these densities have a peak narrower than the grid; their powers "
+                "then lack this peak.",
                 int(missed.sum()), missed.numel(), type(self.density).__name__,
                 total[missed].amin().exp().item(), total[missed].amax().exp().item(), self.points,
             )  # fmt: skip

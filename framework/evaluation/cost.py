@@ -70,8 +70,8 @@ def measure(
     """
     if inputs.dim() == 0 or len(inputs) == 0:
         raise ValueError(
-            f"Got inputs of shape {tuple(inputs.shape)}, but a batch of at least one sample is required to measure the "
-            "cost."
+            f"Got inputs of shape {tuple(inputs.shape)}, but a batch of at least one sample is required to measure "
+            "the cost. Give a batch of the data."
         )
     from torch.utils.flop_counter import FlopCounterMode  # slow to import; only measurements need it
 
@@ -106,8 +106,8 @@ def wall_time(
     """
     if repeats < 1 or not budget_seconds > 0:
         raise ValueError(
-            f"Got repeats = {repeats} and budget_seconds = {budget_seconds}; expected repeats >= 1 and budget_seconds "
-            "> 0."
+            f"Got repeats = {repeats} and budget_seconds = {budget_seconds}, but repeats must be at least 1 and "
+            "budget_seconds above 0. Raise them."
         )
     start = time.perf_counter()
     for _ in range(2):

@@ -69,8 +69,8 @@ def reference_value(log_probs: LogProbs, value: int, seeds: Sequence[int]) -> Re
     if len(not_finite):
         raise ValueError(
             f"The reference log-likelihood of sample {int(not_finite[0])} is {pooled[not_finite[0]].item()} "
-            f"({len(not_finite)} samples have such a value), but must be finite. Raise the reference value, or "
-            "correct the density head."
+            f"({len(not_finite)} samples have such a value), but must be finite. Set mode.reference to a larger "
+            "value of the knob, or correct the density head."
         )
     left_out = torch.stack(
         [torch.cat([per_seed[:r], per_seed[r + 1 :]]).logsumexp(0).mean() for r in range(len(seeds))]

@@ -301,7 +301,10 @@ def _check(
     repeats: int,
 ) -> None:
     if not batches:
-        raise ConfigError("Got no batch, but error against run time is measured on at least one.")
+        raise ConfigError(
+            "Got no batch of data, but error against run time is measured on at least one batch. Give at least one "
+            "batch."
+        )
     if not values:
         advice = f", for example {parts[0].knobs[knob]} for {type(parts[0]).__name__}" if parts else ""
         raise ConfigError(f"Got no values of {knob}. Give at least one value{advice}.")

@@ -107,8 +107,8 @@ def common_description(members: Sequence[Description]) -> Description:
             fixed = " ".join(f"data.{key}={value}" for key, value in values.items())
             raise CheckpointError(
                 f"{other.path} and {first.path} differ in {', '.join(f'data.{key}' for key in differing)}, so one "
-                "may have been trained on test data of the other. Train the members on the same data, with "
-                f"{fixed} in all."
+                "model may have been trained on test data of the other. Train all members on the same data: add "
+                f"{fixed} to the command of each."
             )
         for key in ("density_head", "encoder", "uncertainty"):
             if other.config[key] != first.config[key]:

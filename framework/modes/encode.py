@@ -227,7 +227,8 @@ def encode(
             if sample_count != len(files):
                 raise DataError(
                     f"{files[0]} … {files[-1]}: {len(files)} files contain {sample_count} samples, but mode=encode "
-                    "needs one sample per file. Split the files."
+                    "needs one sample per file. Split files with several samples, and leave out files without a "
+                    "sample."
                 )
             batches = Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=0)
             part_features: list[Tensor] = []

@@ -138,8 +138,8 @@ def aggregate(rows: Sequence[Row], by: Sequence[str], over: str = "seed") -> lis
         missing = [key for key in (*by, over) if key not in row]
         if missing:
             raise ConfigError(
-                f"A result lacks {missing[0]!r}, by which results are aggregated. Keys of the result: "
-                f"{', '.join(row)}."
+                f"A result lacks the key {missing[0]!r}, by which results are to be aggregated. Choose among the "
+                f"keys of the result: {', '.join(row)}."
             )
         groups.setdefault((*(row[key] for key in by), _synthetic(row)), []).append(row)
     return [_aggregate_group(members, by, over) for members in groups.values()]

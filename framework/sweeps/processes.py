@@ -167,7 +167,7 @@ class _Server:
         self._channel.settimeout(PATIENCE)
         try:
             if not self._channel.recv(LARGEST):
-                raise OSError("the server process ended at its start")
+                raise OSError("the process that starts the jobs ended at its own start")
         except OSError:
             self.close()
             raise
@@ -187,7 +187,10 @@ class _Server:
         arguments = command[_target_index(command) + len(_run_target(command)) :]
         packet = json.dumps({"arguments": arguments, "environment": changed_variables}).encode()
         if len(packet) > LARGEST:
-            raise OSError("the description of the job exceeds a packet")
+            raise OSError(
+                f"the command and the environment of the job have {len(packet)} bytes, but at most {LARGEST} fit "
+                "into one packet"
+            )
         socket.send_fds(self._channel, [packet], [console, lock])
         path = Path(f"/proc/self/fd/{console}").readlink()  # the caller closes the descriptor soon
 

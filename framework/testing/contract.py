@@ -177,8 +177,8 @@ def _defaults(group: str, name: str, config: Mapping[str, Any], label: str) -> t
             refused.append(str(error))
     if not accepted:
         raise ConfigError(
-            f"The {group} {name!r} cannot be checked without a rows.py, because it accepts none of the "
-            f"{'input shapes' if group == 'encoder' else 'targets'} that plugins without rows are tried with: "
+            f"The {group} {name!r} has no rows.py and cannot be checked, because it accepts none of the "
+            f"{'input shapes' if group == 'encoder' else 'targets'} that mode=check tries for such plugins: "
             f"{' '.join(refused)} Write a rows.py for the plugin, as framework.testing.rows describes."
         )
     return tuple(accepted)

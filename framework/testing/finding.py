@@ -146,7 +146,7 @@ def at_most(seconds: float) -> Iterator[None]:
         return
 
     def raise_too_slow(number: int, frame: Any) -> None:
-        raise TooSlow(f"did not end within {seconds:g} s of processor time")
+        raise TooSlow(f"the call did not end within {seconds:g} s of processor time")
 
     before = signal.signal(signal.SIGPROF, raise_too_slow)
     signal.setitimer(signal.ITIMER_PROF, seconds)

@@ -127,7 +127,7 @@ class MlflowStore(Store):
         # a journal may come from an untrusted source, so files outside the run folder must not be sent
         try:
             if not file.is_relative_to(self._folder) or ".." in file.parts:
-                raise DataError("the path names a file in another folder")
+                raise DataError("the path contains `..`, or begins outside of the folder")
             require_plain_within(file, self._folder)
             if file.is_dir():
                 require_enclosed(file)

@@ -204,7 +204,7 @@ class Batches:
         trainer: Any = self.trainer  # Any: Lightning types its counters by a base class that lacks them
         if trainer is None:
             raise ConfigError(
-                "The training batches were requested before `attach(trainer)` was called. Call it first."
+                "The training batches were requested before `attach(trainer)` was called. Call `attach` first."
             )
         limit = trainer.limit_train_batches
         batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)

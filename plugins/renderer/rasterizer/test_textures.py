@@ -167,7 +167,7 @@ def test_subjects_that_do_not_fit_together_are_not_joined() -> None:
     with pytest.raises(ValueError, match="Got no scene to join"):
         join_scenes([])
     other = textured_body(wrap="clamp")
-    with pytest.raises(ValueError, match="different wrap or smooth"):
+    with pytest.raises(ValueError, match="The textures of the scenes differ in `wrap` or `smooth`"):
         join_scenes([textured_body(), other])
 
 

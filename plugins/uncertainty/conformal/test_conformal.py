@@ -210,7 +210,7 @@ def test_too_few_samples_make_the_set_everything_and_it_is_said(score, caplog):
     assert wrapper(inputs).labels().all()  # before calibration too
     wrapper.calibrate(batches(inputs, label))
     assert wrapper.threshold.item() == math.inf and wrapper(inputs).labels().all()
-    assert "with 8 validation samples" in caplog.text and "9 samples would be enough" in caplog.text
+    assert "8 validation samples are too few" in caplog.text and "9 samples are enough" in caplog.text
     caplog.clear()
     inputs, label = moons(18)
     wrapper.calibrate(batches(inputs, label))
@@ -238,7 +238,9 @@ def test_bad_sets_get_a_sentence():
     inputs[[first, second]] = math.nan
     with pytest.raises(UserError, match=rf"score of validation samples \[{first}, {second}\] is NaN"):
         around(PredictorOf(sure_classifier)).calibrate(batches(inputs, label))
-    with pytest.raises(UserError, match="conformal is calibrated on the validation split, but got no sample"):
+    with pytest.raises(
+        UserError, match="conformal is calibrated on the validation split, but this split is empty"
+    ):
         around(PredictorOf(sure_classifier)).calibrate(iter(()))
     with pytest.raises(UserError, match="at least 2 samples are required, but got one sample"):
         around(PredictorOf(sure_classifier)).calibrate(batches(inputs[:1], label[:1]))

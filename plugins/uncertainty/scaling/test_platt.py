@@ -193,7 +193,9 @@ def test_bad_sets_and_targets_get_a_sentence():
     logits[[2, 80], 1] = math.nan
     with pytest.raises(UserError, match=r"class probabilities of validation samples \[2, 80\] is NaN"):
         around().calibrate(batches(logits, label))
-    with pytest.raises(UserError, match="platt is calibrated on the validation split, but got no sample"):
+    with pytest.raises(
+        UserError, match="platt is calibrated on the validation split, but this split is empty"
+    ):
         around().calibrate(iter(()))
     with pytest.raises(ConfigError, match="uncertainty platt describes targets of kind 'class'"):
         around(target=Target("angle", ("azimuth",)))

@@ -215,7 +215,7 @@ def test_nan_is_named_and_an_empty_set_refused():
         around(PredictorOf(classes)).calibrate(once(logits, label))
     for nothing in (iter(()), once(logits[:0], label[:0])):
         with pytest.raises(
-            UserError, match="temperature is calibrated on the validation split, but got no sample"
+            UserError, match="temperature is calibrated on the validation split, but this split is empty"
         ):
             around(PredictorOf(classes)).calibrate(nothing)
 
