@@ -167,7 +167,8 @@ class XGBoostHead(DensityHead, Fitted):
             or bool(len(content)) != bool(size)
         ):
             raise ValueError(
-                "`model` is not a row of bytes, or `read` is not the number of features that the model reads"
+                "the stored `model` is not a row of bytes, or `read`, the number of features that the trees read, "
+                "does not fit; expected both empty or both set"
             )
         if len(content):
             require_boosting(content.tobytes(), self.classes, self.numbers, int(size))

@@ -124,8 +124,8 @@ def _array(name: str, stored: Any, buffer: Tensor) -> np.ndarray:
     Floating-point numbers may have another precision than the buffer, as in the state of a model in half precision.
     """
     if not isinstance(stored, Tensor) or stored.layout != torch.strided or stored.is_quantized:
-        raise ValueError(f"{name} is not an array of numbers")
+        raise ValueError(f"the stored value of `{name}` is not a dense array of numbers")
     if stored.dtype != buffer.dtype and not (stored.is_floating_point() and buffer.is_floating_point()):
-        raise ValueError(f"{name} has the dtype {stored.dtype}, expected {buffer.dtype}")
+        raise ValueError(f"the stored array `{name}` has the dtype {stored.dtype}; expected {buffer.dtype}")
     stored = stored.detach().to("cpu", buffer.dtype)
     return (stored.float() if stored.dtype == torch.bfloat16 else stored).numpy()  # NumPy has no bfloat16

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from framework.errors import shorten
 from plugins.density_head.trees.ubjson import parse
 
 NOBODY = 2**31 - 1
@@ -38,10 +39,10 @@ def require_boosting(content: bytes, classes: int, numbers: int, features: int) 
     Raises:
         ValueError: the bytes are not such a model; the message is a clause that says what is wrong.
     """
-    model = _require_keys(parse(content), "the model", {"learner", "version"})
+    model = _require_keys(parse(content), "the top level", {"learner", "version"})
     version = model["version"]
     if not _are_integers(version) or len(version) != 3:
-        raise ValueError("version does not consist of three integers")
+        raise ValueError("the stored `version` of xgboost does not consist of three integers")
     learner = _require_keys(
         model["learner"],
         "learner",
@@ -81,10 +82,15 @@ def require_boosting(content: bytes, classes: int, numbers: int, features: int) 
         forest.get("cats", {}), "cats", set(), {"enc", "feature_segments", "sorted_idx"}
     ).items():
         if not isinstance(part, list | np.ndarray) or len(part):
-            raise ValueError(f"cats.{name} is not empty")
+            raise ValueError(
+                f"the entry `cats.{name}` of the stored model is not empty; expected a model without categories"
+            )
     trees = forest["trees"]
     if not isinstance(trees, list) or not trees or len(trees) % numbers:
-        raise ValueError(f"the number of trees is not a positive multiple of the {numbers} sums")
+        raise ValueError(
+            f"the stored model has no list of trees whose number is a positive multiple of {numbers}, the number of "
+            "sums of trees"
+        )
     counted = {"num_parallel_tree": "1", "num_trees": str(len(trees))}
     _require_equal(forest["gbtree_model_param"], counted, "gbtree_model_param")
     _require_equal(forest["iteration_indptr"], [*range(0, len(trees) + 1, numbers)], "iteration_indptr")
@@ -107,32 +113,42 @@ def _require_tree(tree: Mapping[str, Any], number: int, features: int) -> None:
     for name, dtype in (types | CATEGORIES).items():
         array, length = tree[name], count if name in types else 0
         if not isinstance(array, np.ndarray) or array.dtype != dtype or len(array) != length:
-            raise ValueError(f"tree {number}: {name} is not an array of {length} numbers of type {dtype}")
+            raise ValueError(
+                f"the array `{name}` of tree {number} has another type or length than expected: {length} numbers of "
+                f"type {dtype}"
+            )
     left, right, parent, feature = (tree[name].astype(np.int64) for name in LINKS)
     inner = np.flatnonzero(left >= 0)
     outer = np.flatnonzero(left < 0)
     children = np.concatenate([left[inner], right[inner]])
     if count == 0 or (left[outer] != -1).any() or (right[outer] != -1).any():
-        raise ValueError(f"tree {number} has no node, or a node with only one child")
+        raise ValueError(
+            f"tree {number} has no node, or a node with only one child; expected two children or none for each node"
+        )
     if len(children) != count - 1 or (children <= 0).any() or (children >= count).any():
         raise ValueError(
-            f"tree {number} has nodes without a parent beside its root, or children that do not exist"
+            f"tree {number} has nodes other than the root without a parent, or children that do not exist; expected "
+            "one parent for each node except the root"
         )
     if (np.bincount(children, minlength=count)[1:] != 1).any():
         raise ValueError(f"tree {number} has a node with two parents, so that a walk might not end")
     wanted = np.full(count, NOBODY)
     wanted[left[inner]] = wanted[right[inner]] = inner
     if (parent != wanted).any():
-        raise ValueError(f"tree {number} has a node whose stored parent is not its parent")
+        raise ValueError(
+            f"tree {number} has a node whose stored parent is not the node of which it is a child"
+        )
     if (feature < 0).any() or (feature >= features).any():
-        raise ValueError(f"tree {number} reads a feature that is not among the {features} features")
+        raise ValueError(f"tree {number} reads a feature whose number is not from 0 to {features - 1}")
     if tree["split_type"].any() or (tree["default_left"] > 1).any():
         raise ValueError(
-            f"tree {number} has splits by categories or with an invalid default, expected splits by numbers"
+            f"tree {number} has splits by categories, or an invalid default direction; expected splits by numbers"
         )
     condition = tree["split_conditions"]
     if np.isnan(condition).any() or not np.isfinite(condition[outer]).all():
-        raise ValueError(f"tree {number} has a leaf that is not finite, or a threshold that is NaN")
+        raise ValueError(
+            f"tree {number} has a leaf whose value is not finite, or a threshold that is NaN; expected finite leaves"
+        )
 
 
 def _require_base_score(text: Any, numbers: int) -> None:
@@ -141,18 +157,27 @@ def _require_base_score(text: Any, numbers: int) -> None:
     Versions of xgboost since 3.1 write a list.
     """
     if not isinstance(text, str) or not re.fullmatch(r"\[?[-+.,\dE]{1,100000}\]?", text):
-        raise ValueError("base_score is not a list of numbers")
+        raise ValueError("the stored `base_score` is not a text of numbers")
     scores = [float(part) for part in text.strip("[]").split(",")]
     if len(scores) not in (1, numbers) or not all(map(math.isfinite, scores)):
-        raise ValueError(f"base_score does not consist of 1 or {numbers} finite numbers")
+        raise ValueError(
+            f"the stored `base_score` has {len(scores)} numbers, of which some may not be finite; expected 1 or "
+            f"{numbers} finite numbers"
+        )
 
 
 def _require_keys(
     value: Any, name: str, wanted: Set[str], optional: Set[str] = frozenset()
 ) -> dict[str, Any]:
     if not isinstance(value, dict) or not wanted <= value.keys() <= wanted | optional:
-        keys = ", ".join(sorted(wanted)) or "no further keys"
-        raise ValueError(f"{name} has other keys than expected: {keys}")
+        keys = set(value) if isinstance(value, dict) else set()
+        missing, surplus = (
+            shorten(", ".join(sorted(names)), 60) or "none"
+            for names in (wanted - keys, keys - wanted - optional)
+        )
+        raise ValueError(
+            f"{name} of the stored model has other keys than expected; missing: {missing}; unexpected: {surplus}"
+        )
     return dict(value)
 
 
@@ -162,7 +187,9 @@ def _require_equal(value: Any, wanted: Any, name: str) -> None:
         or value != wanted
         or (isinstance(value, list) and not _are_integers(value))
     ):
-        raise ValueError(f"{name} is not {str(wanted)[:100] or 'empty'}")
+        raise ValueError(
+            f"{name} of the stored model is {shorten(repr(value), 60)}; expected {shorten(repr(wanted), 60)}"
+        )
 
 
 def _are_integers(values: Any) -> bool:

@@ -34,7 +34,9 @@ def parse(content: bytes) -> Any:
     reader = _Reader(content)
     content_value = reader.value(0)
     if reader.place != len(content):
-        raise ValueError(f"{len(content) - reader.place} bytes follow the end of the content")
+        raise ValueError(
+            f"{len(content) - reader.place} bytes follow after the end of the UBJSON content; expected none"
+        )
     return content_value
 
 
@@ -45,7 +47,7 @@ class _Reader:
     def take(self, size: int) -> bytes:
         if not 0 <= size <= len(self.content) - self.place:
             raise ValueError(
-                f"{size} more bytes are announced at byte {self.place}, but the content ends earlier"
+                f"the UBJSON content announces {size} more bytes at byte {self.place}, but ends earlier"
             )
         self.place += size
         return self.content[self.place - size : self.place]
@@ -55,7 +57,9 @@ class _Reader:
 
     def length(self) -> int:
         if self.marker() != "L":
-            raise ValueError(f"byte {self.place - 1} does not begin a length")
+            raise ValueError(
+                f"byte {self.place - 1} of the UBJSON content does not begin a length; expected L"
+            )
         return LENGTH.unpack(self.take(8))[0]
 
     def text(self) -> str:
@@ -63,7 +67,9 @@ class _Reader:
 
     def value(self, depth: int) -> Any:
         if depth > DEEPEST:
-            raise ValueError(f"values are nested more than {DEEPEST} levels deep")
+            raise ValueError(
+                f"the values of the UBJSON content are nested more than {DEEPEST} levels deep, which is not allowed"
+            )
         kind = self.marker()
         if kind == "{":
             return self._object(depth)
@@ -75,14 +81,19 @@ class _Reader:
             return NUMBERS[kind].unpack(self.take(NUMBERS[kind].size))[0]
         if kind in WORDS:
             return WORDS[kind]
-        raise ValueError(f"byte {self.place - 1} does not begin a value")
+        raise ValueError(
+            f"byte {self.place - 1} of the UBJSON content does not begin a value of a known type"
+        )
 
     def _object(self, depth: int) -> dict[str, Any]:
         entries: dict[str, Any] = {}
         while self.content[self.place : self.place + 1] != b"}":
             key = self.text()
             if key in entries:
-                raise ValueError(f"a key is repeated before byte {self.place}")
+                raise ValueError(
+                    f"a key of the UBJSON content is repeated before byte {self.place}; expected different keys in "
+                    "an object"
+                )
             entries[key] = self.value(depth + 1)
         self.place += 1
         return entries
@@ -92,15 +103,19 @@ class _Reader:
         if marker == "$":
             kind, marker = self.marker(), self.marker()
             if kind not in ARRAYS:
-                raise ValueError(f"byte {self.place - 2} is not a known type of an array")
+                raise ValueError(
+                    f"byte {self.place - 2} of the UBJSON content is not a known type of the numbers of an array"
+                )
         if marker != "#":
-            raise ValueError(f"byte {self.place - 1} does not begin the length of an array")
+            raise ValueError(
+                f"byte {self.place - 1} of the UBJSON content does not begin the length of an array; expected #"
+            )
         count = self.length()
         if kind:
             dtype = np.dtype(ARRAYS[kind])
             return np.frombuffer(self.take(count * dtype.itemsize), dtype)
         if not 0 <= count <= len(self.content) - self.place:  # each value takes at least one byte
             raise ValueError(
-                f"{count} values are announced at byte {self.place}, but the content ends earlier"
+                f"the UBJSON content announces {count} values at byte {self.place}, but ends earlier"
             )
         return [self.value(depth + 1) for _ in range(count)]
