@@ -74,7 +74,8 @@ def read(file: Path) -> Subject:
             parts = list(_read_parts(document, parents))
         except KeyError as error:
             raise ValueError(
-                f"the key {shorten(error)} is missing, or its value is not one of the possible values"
+                f"the description of the glTF file lacks the key {shorten(error)}, or uses this value where it is "
+                "not allowed"
             ) from error
         return join_parts(parts, "y", document.notes)
 
@@ -130,7 +131,9 @@ def _find_parents(document: Document) -> dict[int, int | None]:
         number, parent = waiting.pop()
         node = document.item("nodes", number)
         if number in parents_of:
-            raise ValueError(f"node {number} has two parents, or is its own ancestor")
+            raise ValueError(
+                f"node {number} of the glTF file has two parents, or is its own ancestor; expected a tree of nodes"
+            )
         parents_of[number] = parent
         waiting += [(child, number) for child in reversed(node.get("children", []))]
     return parents_of
@@ -189,7 +192,8 @@ def _pose_part(
     sets = sum(name.startswith("JOINTS_") for name in attributes)
     if sets > MOST_JOINT_SETS:
         raise ValueError(
-            f"a part has {4 * sets} joints at each vertex, but at most {4 * MOST_JOINT_SETS} are supported"
+            f"a part of the glTF file has {4 * sets} joints at each vertex, but at most {4 * MOST_JOINT_SETS} are "
+            "supported"
         )
     for number in range(sets):
         joint_numbers = document.numbers(attributes[f"JOINTS_{number}"], 4)
@@ -207,8 +211,8 @@ def _read_part(document: Document, primitive: dict[str, Any]) -> Part:
     positions = document.item("accessors", attributes["POSITION"])
     if "extensions" in primitive and not {"bufferView", "sparse"} & positions.keys():
         raise DataError(
-            f"the vertices are stored only by {shorten(', '.join(primitive['extensions']))}, which is not supported. "
-            "Save the file without compression."
+            f"the vertices of the glTF file are stored only by {shorten(', '.join(primitive['extensions']))}, which "
+            "is not supported. Save the file without compression."
         )
     vertices = document.numbers(attributes["POSITION"], 3).astype(np.float64)
     count = len(vertices)
@@ -217,7 +221,7 @@ def _read_part(document: Document, primitive: dict[str, Any]) -> Part:
         order = document.numbers(primitive["indices"], 1)[:, 0].astype(np.int64)
     if order.size and order.max() >= count:
         raise ValueError(
-            f"a face refers to vertex {order.max()}, but the vertices are numbered 0 to {count - 1}"
+            f"a face of the glTF file refers to vertex {order.max()}, but the vertices are numbered 0 to {count - 1}"
         )
     faces = _read_triangles(order, primitive.get("mode", TRIANGLES))
     factor, texture = _read_material(document, primitive)
@@ -234,7 +238,8 @@ def _read_part(document: Document, primitive: dict[str, Any]) -> Part:
 def _check_count(values: NDArray, count: int, quantity: str) -> NDArray:
     if len(values) != count:
         raise ValueError(
-            f"got {len(values)} values of {quantity} for {count} vertices, expected one per vertex"
+            f"the glTF file has {len(values)} values of {quantity} for {count} vertices; expected one value per "
+            "vertex"
         )
     return values
 
@@ -248,7 +253,9 @@ def _read_triangles(order: Int[np.ndarray, "corners"], mode: Any) -> Int[np.ndar
         return order[np.stack([inner, inner + 1 + inner % 2, inner + 2 - inner % 2], 1)]
     if mode == FAN:
         return order[np.stack([inner + 1, inner + 2, np.zeros_like(inner)], 1)]
-    raise ValueError(f"the mode of a primitive is {quote(mode)}, expected 4, 5 or 6 (triangles, strip, fan)")
+    raise ValueError(
+        f"the mode of a primitive of the glTF file is {quote(mode)}; expected 4, 5 or 6 (triangles, strip, fan)"
+    )
 
 
 def _read_material(

@@ -56,7 +56,8 @@ class Document:
         items = self.content.get(kind, [])
         if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < len(items):
             raise ValueError(
-                f"the file refers to number {quote(number)} of its {kind}, but has {len(items)} of them"
+                f"the glTF file refers to entry {quote(number)} of `{kind}`, which has {len(items)} entries "
+                "(numbered from 0)"
             )
         return items[number]
 
@@ -75,12 +76,12 @@ class Document:
             else:
                 extensions = ", ".join(described.get("extensions", {}))
                 reason = (
-                    f"; it is stored by {shorten(extensions)}, which is not supported. Save the file without this "
+                    f"; they are stored by {shorten(extensions)}, which is not supported. Save the file without this "
                     "extension"
                     if extensions
                     else ""
                 )
-                raise ValueError(f"buffer {number} is missing{reason}")
+                raise ValueError(f"the data of buffer {number} are missing in the glTF file{reason}")
         return self.buffers[number]
 
     def read_address(self, address: str) -> bytes:
@@ -88,7 +89,9 @@ class Document:
         if address.startswith("data:"):
             head, _, body = address.partition(",")
             if not head.endswith(";base64"):
-                raise ValueError(f"data is encoded as {quote(head[-20:])}, but only base64 is supported")
+                raise ValueError(
+                    f"data within the glTF file are encoded as {quote(head[-20:])}, but only base64 is supported"
+                )
             return base64.b64decode(body, validate=True)
         return self.read_file(resolve_beside(self.folder, unquote(address, errors="surrogateescape")))
 
@@ -109,7 +112,8 @@ class Document:
         )
         if start + length > len(buffer):
             raise ValueError(
-                f"a buffer has {len(buffer)} bytes, but {start + length} are required; the file is cut short"
+                f"a buffer of the glTF file has {len(buffer)} bytes, but {start + length} bytes are required; the "
+                "file is cut short"
             )
         return memoryview(buffer)[start : start + length], whole_number(described.get("byteStride", 0))
 
@@ -123,7 +127,10 @@ class Document:
         """
         described = self.item("accessors", number)
         if WIDTHS.get(described["type"]) != width:
-            raise ValueError(f"expected {width} numbers per element, got the type {quote(described['type'])}")
+            raise ValueError(
+                f"accessor {quote(number)} of the glTF file has the type {quote(described['type'])}; expected a type "
+                f"with {width} numbers per element"
+            )
         count, kind = whole_number(described["count"]), np.dtype(NUMBERS[described["componentType"]])
         self.check_size(count * width * 8)
         values = np.zeros((count, width), kind)
@@ -152,7 +159,8 @@ class Document:
         stride = stride or size
         if stride < size or (count and offset + (count - 1) * stride + size > len(data)):
             raise ValueError(
-                f"{count} elements are declared, but there are only {len(data)} bytes; the file is cut short"
+                f"the glTF file declares {count} elements, but only {len(data)} bytes hold them; the file is cut "
+                "short"
             )
         return np.ndarray((count, width), kind, data, offset, (stride, kind.itemsize))
 
@@ -164,7 +172,8 @@ class Document:
         """
         if needed > max(SCENE_BYTES, UNFOLDED_TIMES * self.size):
             raise ValueError(
-                f"{self.size} bytes of the file would become {needed} bytes; the file repeats itself, or is damaged"
+                f"the {self.size} bytes of the glTF file would become {needed} bytes; the file refers to the same "
+                "data too often, or is damaged"
             )
 
 
@@ -175,10 +184,13 @@ def open_document(file: Path) -> Document:
     if content[:4] == b"glTF":
         content, binary = _split_chunks(content)
     elif file.suffix.lower() == ".glb":
-        raise ValueError("the file does not begin with the bytes glTF")
+        raise ValueError("the file does not begin with the four bytes glTF of a .glb file")
     description = json.loads(content)
     if not isinstance(description, dict):
-        raise ValueError(f"the description is a {type(description).__name__}, expected an object")
+        raise ValueError(
+            f"the JSON description of the glTF file is a {type(description).__name__}, but an object ({{...}}) is "
+            "required"
+        )
     return Document(description, file.parent, binary, size)
 
 
@@ -196,11 +208,14 @@ def _split_chunks(content: bytes) -> tuple[bytes, bytes | None]:
         size = int.from_bytes(content[offset : offset + 4], "little")
         kind = content[offset + 4 : offset + 8]
         if offset + 8 + size > length:
-            raise ValueError("a chunk continues beyond the end of the file")
+            raise ValueError(
+                f"the .glb file is cut short: a chunk that begins at byte {offset} takes {size} bytes, but only "
+                f"{length - offset - 8} bytes follow"
+            )
         chunks.setdefault(kind, content[offset + 8 : offset + 8 + size])
         offset += 8 + size
     if b"JSON" not in chunks:
-        raise ValueError("the file has no JSON description")
+        raise ValueError("the .glb file has no chunk named JSON with its description")
     return chunks[b"JSON"], chunks.get(b"BIN\0")
 
 
@@ -216,5 +231,7 @@ def to_numbers(value: Any) -> NDArray:
 def whole_number(value: Any) -> int:
     """Return a value of the description after checking that it is an integer of at least 0."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-        raise ValueError(f"expected a whole number of at least 0, got {quote(value)}")
+        raise ValueError(
+            f"expected a whole number of at least 0 in the description of the glTF file, got {quote(value)}"
+        )
     return value

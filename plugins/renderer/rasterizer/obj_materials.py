@@ -152,7 +152,8 @@ def _read_corners(content: bytes) -> FaceCorners:
     uv_rows = mesh_files.from_zero(mesh_files.numbers(words, np.int64), uv_counts, sizes)
     if uv_rows.size and not (uv_rows.min() >= -1 and uv_rows.max() < len(uv)):
         raise ValueError(
-            f"a face refers to texture coordinate {uv_rows.max() + 1}, but they are numbered 1 to {len(uv)}"
+            f"a face of the OBJ file refers to texture coordinate {uv_rows.max() + 1}, but the texture coordinates "
+            f"are numbered 1 to {len(uv)}"
         )
     triangles = mesh_files.fans(sizes, uv_rows)
     repeated = np.repeat(np.arange(len(sizes)), sizes - 2)
@@ -176,7 +177,7 @@ def _read_materials(library: Path) -> dict[str, Material]:
                 )[0]
                 if not np.isfinite(color).all():
                     raise ValueError(
-                        f"the colour Kd is {color.tolist()}, expected three finite numbers from 0 to 1"
+                        f"the colour Kd of a material is {color.tolist()}; expected three finite numbers from 0 to 1"
                     )
                 current.color = color
             elif key == b"map_Kd":
@@ -193,7 +194,8 @@ def _set_texture(material: Material, words: list[str], library: Path) -> None:
             words = words[1 + OPTIONS[words[0]] :]
         else:
             raise ValueError(
-                f"a texture has the option {quote(words[0])}, which is not supported. Save the file without this option"
+                f"a texture of the material file has the option {quote(words[0])}, which is not supported. Save the "
+                "file without this option"
             )
     if words:
         material.texture, material.library = " ".join(words).strip(), library

@@ -95,10 +95,14 @@ def join_parts(parts: Sequence[Part], up: Axis, notes: Sequence[str] = ()) -> Su
     for part in parts:
         for quantity, numbers in (("coordinate", part.vertices), ("texture coordinate", part.uv)):
             if numbers is not None and not np.isfinite(numbers).all():
-                raise DataError(f"a {quantity} is not finite. Copy the file again from its source.")
+                raise DataError(
+                    f"a {quantity} of the scene is not finite; expected finite numbers. Copy the file again from its "
+                    "source."
+                )
         if np.abs(part.vertices).max() > FARTHEST:
             raise DataError(
-                f"a coordinate is beyond {FARTHEST:g}; coordinates should be in metres. Scale the scene down."
+                f"a coordinate of the scene is larger than {FARTHEST:g}; expected coordinates in metres. Scale the "
+                "scene down."
             )
     wrap, smooth = _find_wrap(parts), all(part.smooth for part in parts if part.image is not None)
     scene = join_scenes([_part_to_scene(part, wrap, smooth) for part in parts])
@@ -149,8 +153,9 @@ def _find_wrap(parts: Sequence[Part]) -> Wrap:
         needed.update(wrap for wrap, reaches in zip(part.wraps, beyond, strict=True) if reaches)
     if len(needed) > 1:
         raise DataError(
-            f"the textures continue beyond their edges in different ways ({', '.join(sorted(needed))}), but a scene "
-            "has a single way. Change the samplers, or draw the parts separately."
+            f"the textures of the scene continue beyond their edges in different ways ({', '.join(sorted(needed))}), "
+            "but a scene has only one way for all. Set the same wrap mode in all samplers, or draw the parts "
+            "separately."
         )
     return next(iter(needed or stated)) if len(needed or stated) == 1 else "clamp"
 

@@ -365,7 +365,9 @@ def test_extreme_subjects_are_drawn_or_raise_a_clear_message(
         ]
         (tmp_path / "ball.off").write_text("\n".join([f"OFF\n{len(vertices)} {len(ball.faces)} 0", *lines]))
         if scale == 1e40:
-            with pytest.raises(DataError, match=r"ball\.off: a coordinate is beyond 1e\+30"):
+            with pytest.raises(
+                DataError, match=r"ball\.off: a coordinate of the scene is larger than 1e\+30"
+            ):
                 run_command(tmp_path / "ball.off", tmp_path)
         else:
             shown.append(np.asarray(run_command(tmp_path / "ball.off", tmp_path), int))

@@ -555,33 +555,42 @@ def test_the_total_size_of_textures_is_limited(tmp_path: Path, monkeypatch: pyte
             lambda whole: whole["meshes"][0]["primitives"][0].update(mode=0),
             "the file has no faces, only points",
         ),
-        (lambda whole: whole["nodes"][0].update(children=[0]), "node 0 has two parents"),
+        (lambda whole: whole["nodes"][0].update(children=[0]), "node 0 of the glTF file has two parents"),
         (
             lambda whole: whole["nodes"][0].update(mesh=7),
-            "the file refers to number 7 of its meshes, but has 1",
+            "the glTF file refers to entry 7 of `meshes`, which has 1",
         ),
-        (lambda whole: whole["nodes"][0].update(translation=[1e400, 0, 0]), "a coordinate is not finite"),
-        (lambda whole: whole["accessors"][0].update(count=10**9), "the file repeats itself, or is damaged"),
+        (
+            lambda whole: whole["nodes"][0].update(translation=[1e400, 0, 0]),
+            "a coordinate of the scene is not finite",
+        ),
+        (
+            lambda whole: whole["accessors"][0].update(count=10**9),
+            "the file refers to the same data too often, or is damaged",
+        ),
         (
             lambda whole: whole["accessors"][0].update(count=3),
             "refers to vertex 3, but the vertices are numbered 0 to 2",
         ),
-        (lambda whole: whole["accessors"][0].pop("count"), "the key 'count' is missing"),
+        (lambda whole: whole["accessors"][0].pop("count"), "lacks the key 'count'"),
         (lambda whole: whole["bufferViews"][0].update(byteLength=10**9), "the file is cut short"),
-        (lambda whole: whole["textures"][0].update(source=-1), "the file refers to number -1 of its images"),
+        (
+            lambda whole: whole["textures"][0].update(source=-1),
+            "the glTF file refers to entry -1 of `images`",
+        ),
         (
             lambda whole: (
                 whole["accessors"][0].pop("bufferView"),
                 whole["meshes"][0]["primitives"][0].update(extensions={"KHR_draco_mesh_compression": {}}),
             ),
-            "the vertices are stored only by KHR_draco_mesh_compression",
+            "the vertices of the glTF file are stored only by KHR_draco_mesh_compression",
         ),
         (
             lambda whole: (
                 whole["buffers"].append({"byteLength": 48, "extensions": {"EXT_meshopt_compression": {}}}),
                 whole["bufferViews"][0].update(buffer=1),
             ),
-            "buffer 1 is missing; it is stored by EXT_meshopt_compression",
+            "the data of buffer 1 are missing in the glTF file; they are stored by EXT_meshopt_compression",
         ),
     ],
 )

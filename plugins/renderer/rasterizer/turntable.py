@@ -174,7 +174,9 @@ def _read_values(file: Path) -> dict[str, Any]:
         with translate_errors(file, description):
             content = read_bytes(file)
             if len(content) > LARGEST_YAML:
-                raise ValueError(f"the file has {len(content)} bytes, at most {LARGEST_YAML} are read")
+                raise ValueError(
+                    f"the file has {len(content)} bytes, but at most {LARGEST_YAML} bytes are read"
+                )
             camera_values = json.loads(decode(content))
     elif file.suffix.lower() in (".yaml", ".yml"):
         camera_values = read_yaml(file, description)
