@@ -45,10 +45,10 @@ def read_nifti(file: Path) -> Mapping[str, np.ndarray]:
     arrays = {"spectra": to_real(images.dataobj, "spectra"), "affine": np.asarray(images.affine)}
     if not offsets_file.is_file():
         raise DataError(
-            f"The folder of this file holds no {offsets_file.name}. Write the offsets of the images in ppm into such a "
-            "file, one offset a line."
+            f"{file}: the folder of this file holds no {offsets_file.name}. Write the offsets of the images in ppm "
+            "into a file of this name, one offset per line."
         )
-    with translate_errors(offsets_file, "offsets", "Write one number in ppm a line, one for each image."):
+    with translate_errors(offsets_file, "offsets", "Write one number in ppm per line, one for each image."):
         text = decode(read_bytes(offsets_file))
         arrays["offsets"] = np.array(require_numbers_in(words_of(text), text))
         if len(arrays["offsets"]) != images.shape[-1]:
@@ -58,7 +58,8 @@ def read_nifti(file: Path) -> Mapping[str, np.ndarray]:
             )
     if len(masks) > 1:
         raise DataError(
-            f"The folder of this file holds two masks, {masks[0].name} and {masks[1].name}. Remove one of them."
+            f"{file}: the folder of this file holds two masks, {masks[0].name} and {masks[1].name}. Remove one of "
+            "them."
         )
     for mask in masks:
         remedy = "Copy the mask again from its source, or remove the file to read every voxel with a number."
@@ -66,8 +67,8 @@ def read_nifti(file: Path) -> Mapping[str, np.ndarray]:
             arrays["mask"] = to_real(_read(mask).dataobj, "mask")
             if arrays["mask"].squeeze().shape != arrays["spectra"][..., 0].squeeze().shape:
                 raise DataError(
-                    f"The mask has shape {arrays['mask'].shape}, but the images of {file.name} have shape "
-                    f"{images.shape[:-1]}. Give a mask of the images' shape."
+                    f"{mask}: the mask has shape {arrays['mask'].shape}, but the images of {file.name} have shape "
+                    f"{images.shape[:-1]}. Give a mask with the shape of the images."
                 )
     return arrays
 

@@ -67,7 +67,10 @@ def volume_with(**changes):
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        (volume_with(offsets=None), "The file holds spectra. A volume holds"),
+        (
+            volume_with(offsets=None),
+            "The file holds the arrays spectra, but spectra and offsets are required. A volume holds",
+        ),
         (volume_with(spectra=np.ones((4, 5, 7))), "for 6 offsets"),
         (volume_with(offsets=np.array([0.0, 0, 1, 2, 3, 4])), "occur twice"),
         (volume_with(offsets=np.array([-500.0, -200, -100, 100, 200, 900])), "not in Hz"),

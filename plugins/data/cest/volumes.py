@@ -104,13 +104,16 @@ def _volume(arrays: Mapping[str, Any], size: int) -> Volume:
     """Return the volume in the arrays of a file of `size` bytes."""
     name = next((name for name in SPECTRA if name in arrays), None)
     if name is None or "offsets" not in arrays:
-        raise DataError(f"The file holds {shorten(', '.join(arrays)) or 'nothing'}. {LAYOUT}")
+        raise DataError(
+            f"The file holds the arrays {shorten(', '.join(arrays)) or 'none'}, but spectra and offsets are "
+            f"required. {LAYOUT}"
+        )
     spectra, offsets = to_real(arrays[name], name), to_real(arrays["offsets"], "offsets").ravel()
     if not 2 <= spectra.ndim <= 4 or spectra.shape[-1] != len(offsets):
-        raise DataError(f"{name} has shape {spectra.shape} for {len(offsets)} offsets. {LAYOUT}")
+        raise DataError(f"The array {name} has shape {spectra.shape} for {len(offsets)} offsets. {LAYOUT}")
     if not np.isfinite(offsets).all() or len(np.unique(offsets)) < len(offsets):
         raise DataError(
-            "Some offsets are not finite or occur twice. Correct the list of offsets; the unit is ppm."
+            "Some of the offsets are not finite or occur twice. Correct the list of offsets; the unit is ppm."
         )
     require_numbers(math.prod(spectra.shape[:-1]), MOST_VOXELS, size // 4)
     shape = (*spectra.shape[:-1], *(1,) * (4 - spectra.ndim))
@@ -145,7 +148,8 @@ def _volume(arrays: Mapping[str, Any], size: int) -> Volume:
     )
     if numbers.min() < 0 or numbers.max() >= len(regions):
         raise DataError(
-            f"`region` holds the numbers {numbers.min()} to {numbers.max()}; expected 0 (healthy) and 1 (tumour)."
+            f"The array `region` holds numbers from {numbers.min()} to {numbers.max()}; expected 0 (healthy) and 1 "
+            "(tumour). Correct the array, or leave it out."
         )
     place = np.argwhere(usable)
     left_out = np.argwhere(inside & ~finite)
@@ -170,7 +174,10 @@ def _divide_by_m0(spectra: np.ndarray, offsets: np.ndarray, m0: Any) -> tuple[np
     """
     far = np.abs(offsets) >= UNSATURATED
     if far.all():
-        raise DataError(f"Every offset is {UNSATURATED:g} ppm or more. Write the offsets in ppm, not in Hz.")
+        raise DataError(
+            f"Every offset is {UNSATURATED:g} ppm or more, but offsets near 0 ppm are required. Write the offsets in "
+            "ppm, not in Hz."
+        )
     if m0 is not None:
         unsaturated = to_real(m0, "M0").reshape(*spectra.shape[:-1], 1)
     elif far.any():

@@ -53,12 +53,14 @@ def _read_matlab(file: Path, side: int) -> Tensor:
         or labels.shape != (OBJECTS * VIEWS,)
     ):
         raise DataError(
-            f"{file}: X is {pixels.dtype} of shape {pixels.shape}, and Y holds {labels.size} numbers. {REMEDY}"
+            f"{file}: X has the type {pixels.dtype} and the shape {pixels.shape}, and Y holds {labels.size} numbers; "
+            f"expected uint8 of shape ({OBJECTS * VIEWS}, 1024) and {OBJECTS * VIEWS} numbers. {REMEDY}"
         )
     names, counts = np.unique(labels, return_counts=True)
     if names.tolist() != [*range(1, OBJECTS + 1)] or (counts != VIEWS).any():
         raise DataError(
-            f"{file}: Y must name {OBJECTS} objects with {VIEWS} views each, but does not. {REMEDY}"
+            f"{file}: Y holds {len(names)} different numbers, which occur {counts.min()} to {counts.max()} times; "
+            f"expected the numbers 1 to {OBJECTS} of the objects, {VIEWS} times each. {REMEDY}"
         )
     order = np.argsort(labels, kind="stable")
     # MATLAB stores an image column by column

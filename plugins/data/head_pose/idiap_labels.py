@@ -67,7 +67,9 @@ def _read_struct(content: h5py.File, name: str) -> list[Label]:
     fields = {field: _read_cells(content, struct[field]) for field in (*ANGLES, "name")}
     lengths = {field: len(cells) for field, cells in fields.items()}
     if len(set(lengths.values())) != 1:
-        raise ValueError(f"the fields of {name} have different lengths: {lengths}")
+        raise ValueError(
+            f"the fields of the struct {name} have different lengths: {lengths}; expected one length"
+        )
     texts = [cell.astype("<u2").tobytes().decode("utf-16-le") for cell in fields["name"]]
     pan, tilt, roll = ([float(cell.item()) for cell in fields[angle]] for angle in ANGLES)
     return [
@@ -98,10 +100,11 @@ def _values(content: h5py.File, dataset: Any, most: int) -> np.ndarray:
     plain = dataset.dtype.kind in "iuf" or dataset.dtype == h5py.ref_dtype
     if not plain or max(dataset.size, chunk) > most:
         raise ValueError(
-            f"a dataset of type {dataset.dtype} and shape {dataset.shape}, in chunks of {dataset.chunks}, is no label"
+            f"a dataset has the type {dataset.dtype}, the shape {dataset.shape} and chunks of {dataset.chunks}; "
+            f"expected a label of at most {most} numbers or references"
         )
     if dataset.external or dataset.is_virtual or dataset.file.filename != content.filename:
-        raise ValueError("the values of a dataset lie in another file")
+        raise ValueError("the values of a dataset lie in another file; expected all values in this file")
     return dataset[()]
 
 

@@ -82,7 +82,9 @@ def test_label_file_that_is_cut_short_or_lacks_something_is_named(root: Path) ->
         shorter = content["or_label_train/tilt"][:19]
         del content["or_label_train/tilt"]
         content["or_label_train/tilt"] = shorter
-    with pytest.raises(DataError, match=r"fields of or_label_train have different lengths: .*'tilt': 19"):
+    with pytest.raises(
+        DataError, match=r"fields of the struct or_label_train have different lengths: .*'tilt': 19"
+    ):
         prepare_data("idiap", root)
 
 

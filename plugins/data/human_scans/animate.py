@@ -142,8 +142,8 @@ def cast(
         registration = read_registration(root / "subjects" / name / f"registration_{data.topology}.ply")
     if file is not None:
         raise ConfigError(
-            f"--motion {file}: the body of {who or 'this subject'} is unknown, because only a mesh is known; "
-            "expected a generated person: a test subject of a run whose data.root is null."
+            f"--motion {file}: the motion cannot be applied to {who or 'this subject'}, because its body model is "
+            "unknown. Give a generated person: a test subject of a run whose data.root is null."
         )
     return actor(registration), [Moment(registration.vertices, None)] * frames
 
@@ -169,8 +169,8 @@ def follow_motion(
     numbers = np.round((start + np.arange(frames) / SPEED) / recorded.seconds).astype(int)
     if numbers[0] < 0 or numbers[-1] >= len(recorded.rotations):
         raise ConfigError(
-            f"{frames} frames last {frames / SPEED:g} s, but after second {start:g} the motion {file} lasts "
-            f"{len(recorded.rotations) * recorded.seconds - start:.3g} s. Lower --frames or --start."
+            f"--frames {frames} take {frames / SPEED:g} s, but from --start {start:g} the motion {file} lasts only "
+            f"{len(recorded.rotations) * recorded.seconds - start:.3g} s more. Lower --frames or --start."
         )
     poses = motion.transfer_motion(person.crowd.body, recorded, numbers.tolist())
     return actor(person.registration), [person.at(pose) for pose in poses]

@@ -103,8 +103,9 @@ class HumanScans(Data, SubjectFolder):
     ) -> None:
         if "color" not in renderer.channels or renderer.background:
             raise ConfigError(
-                f"data.renderer = {type(renderer).__name__} does not draw the channel color on black. Choose another "
-                "renderer."
+                f"data.renderer = {type(renderer).__name__} does not draw the channel `color` with a black "
+                "background, which this data set requires. Choose another renderer, such as rasterizer with its "
+                "default background."
             )
         self.renderer = renderer
         self.root = root
@@ -327,9 +328,9 @@ def _common_size(root: Path, subjects: Sequence[Subject]) -> tuple[tuple[int, in
         for view in subject.views:
             if (other := (view.camera.height, view.camera.width)) != size:
                 raise DataError(
-                    f"{folder}: view {view.name} has {other[0]} × {other[1]} pixels, the first image of all has "
-                    f"{size[0]} × {size[1]} (height × width); expected one size. Scale the images and their camera "
-                    "matrices K."
+                    f"{folder}: view {view.name} has {other[0]} × {other[1]} pixels, but the first image of the data "
+                    f"set has {size[0]} × {size[1]} (height × width); expected one size. Scale the images and their "
+                    "camera matrices K."
                 )
     return size, points
 

@@ -124,9 +124,11 @@ def _numbers(text: str) -> dict[str, float]:
         try:
             numbers[name.strip()] = float(number)
         except ValueError:
-            raise DataError(f"{part!r}: expected a name and a number, as in left elbow=60.") from None
+            raise DataError(
+                f"Got {part!r}; expected a name and a number joined by `=`, such as `left elbow=60`."
+            ) from None
         if not abs(numbers[name.strip()]) <= 1e4:
-            raise DataError(f"{part!r}: expected a number from -10000 to 10000.")
+            raise DataError(f"Got {part!r}; expected a number from -10000 to 10000 after `=`.")
     return numbers
 
 

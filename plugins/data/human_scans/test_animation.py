@@ -252,7 +252,7 @@ def test_a_film_needs_its_program_and_people_who_are_there(data, tmp_path, monke
     scan_layout.write_registration(mesh, colored_mesh(0))
     shown, moments = animate.cast(data, str(mesh), None, 2)
     assert len(moments) == 2 and len(shown.colors) == 40
-    with pytest.raises(ConfigError, match="only a mesh is known"):
+    with pytest.raises(ConfigError, match="its body model is unknown"):
         animate.cast(data, str(mesh), tmp_path / "walk.bvh", 2)
     (tmp_path / "walk.bvh").write_text(bvh([{}, TURNS]))
     with pytest.raises(ConfigError, match="Lower --frames"):

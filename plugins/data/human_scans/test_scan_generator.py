@@ -286,7 +286,8 @@ def test_photographs_want_a_renderer_that_tells_the_subject_from_the_ground():
 
     for renderer in (OnWhite(), Colourless()):
         with pytest.raises(
-            ConfigError, match=f"{type(renderer).__name__} does not draw the channel color on black"
+            ConfigError,
+            match=f"{type(renderer).__name__} does not draw the channel `color` with a black background",
         ):
             HumanScans(
                 renderer=renderer, counts=Counts(), drawing=scan_generator.Drawing(), variation=Variation()

@@ -74,8 +74,9 @@ def _check_arrays(file: Path, arrays: dict[str, np.ndarray]) -> Archive:
     )
     if not consistent or (np.diff(offset) < 1).any():
         raise DataError(
-            f"{file}: The {len(offset)} offsets do not divide {len(points)} points into objects of at least one point, "
-            f"each with one of the {len(label)} labels and {len(identity)} numbers in object_id. {REMEDY}"
+            f"{file}: the arrays `offset`, `label` and `object_id` have {len(offset)}, {len(label)} and "
+            f"{len(identity)} numbers for {len(points)} points; expected offsets that ascend from 0 to "
+            f"{len(points)}, and one label and one object_id for each object between two offsets. {REMEDY}"
         )
     classes = tuple(map(str, arrays["classes"].tolist()))
     unknown_label = np.flatnonzero((label < 0) | (label >= len(classes)))

@@ -30,7 +30,7 @@ class Rotated(FetchedInBatches):
     def __getitems__(self, indices: Sequence[int]) -> dict[str, Tensor]:
         index = torch.as_tensor(indices)
         if ((index < 0) | (index >= len(self))).any():
-            raise IndexError(f"An index is out of range; indices are 0 to {len(self) - 1}.")
+            raise IndexError(f"An index is out of range; expected indices from 0 to {len(self) - 1}.")
         batch = self.clouds.__getitems__((index % len(self.clouds)).tolist())
         matrix = self.matrices[index // len(self.clouds)]
         return {**batch, "input": _rotate(batch["input"], matrix), "index": index}

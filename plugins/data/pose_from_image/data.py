@@ -97,8 +97,9 @@ class PoseFromImage(Data):
     ) -> None:
         if "color" not in renderer.channels or renderer.background:
             raise ConfigError(
-                f"data.renderer = {type(renderer).__name__} does not draw the channel color on black. Choose another "
-                "renderer."
+                f"data.renderer = {type(renderer).__name__} does not draw the channel `color` with a black "
+                "background, which this data set requires. Choose another renderer, such as rasterizer with its "
+                "default background."
             )
         self.renderer = renderer
         self.counts = asdict(counts)

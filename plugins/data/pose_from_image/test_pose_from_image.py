@@ -44,6 +44,7 @@ def test_images_want_a_renderer_that_tells_the_body_from_the_ground():
     colourless = type("Colourless", (rasterizer,), {"channels": frozenset({"depth"})})
     for renderer in (on_white(), colourless()):
         with pytest.raises(
-            ConfigError, match=f"{type(renderer).__name__} does not draw the channel color on black"
+            ConfigError,
+            match=f"{type(renderer).__name__} does not draw the channel `color` with a black background",
         ):
             PoseFromImage(renderer=renderer, counts=Counts(), displacement=Apart())

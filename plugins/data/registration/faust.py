@@ -132,7 +132,7 @@ def read_registration(scan: Scan, vertices: int | None = None) -> tuple[np.ndarr
     mesh = read(scan.registration)
     if vertices not in (None, len(mesh.vertices)):
         raise DataError(
-            f"{scan.registration}: {len(mesh.vertices)} vertices, the first registration has {vertices}; expected "
-            "the same mesh in all files. Copy the file again from its source."
+            f"{scan.registration}: the mesh has {len(mesh.vertices)} vertices, but the first registration has "
+            f"{vertices}; expected the same mesh in all files. Copy the file again from its source."
         )
     return mesh.vertices, mesh.faces

@@ -109,9 +109,9 @@ class TableTennis(Data):
         self.short = len(flights) - len(usable)
         if len(usable) < 3:
             raise DataError(
-                f"{root} has {len(flights)} flights, of which {len(usable)} are long enough for {self.grid.least} "
-                f"frames to read and {self.grid.future} to predict without a gap, but at least three such flights are "
-                "required. Lower data.future or data.least, or give more flights."
+                f"{root} has {len(flights)} flights, of which {len(usable)} have {self.grid.least} frames to read "
+                f"and {self.grid.future} frames to predict without a gap; at least three such flights are required. "
+                "Lower data.future or data.least, or give more flights."
             )
         self.lost = sum(count_missing_frames(flight, self.grid.step) for flight in flights)
         order = stream(self.data_seed, "splits").permutation(len(usable))

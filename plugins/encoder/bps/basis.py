@@ -135,5 +135,7 @@ def _in_ball(lattice: Callable[[int], np.ndarray], cell: float, count: int) -> n
                 shifted[chosen] * 2 / (last + next_one)
             )  # the ball ends half way between the last point inside and the next one
     raise ConfigError(
-        f"encoder bps: to rounding, no ball holds exactly points={count} of this lattice. Set points={count + 1}."
+        f"encoder bps: no basis of exactly points={count} can be cut from the chosen lattice, because its points "
+        f"number {count} and {count + 1}, in order of distance from the centre, are equally far from the centre. Set "
+        f"points={count + 1}."
     )

@@ -28,8 +28,9 @@ def predicted_images(
         densities = predictor.training_densities(batch["input"])
     if len(densities.event_shape) != 3 or densities.event_shape[-1] != 3:
         raise ConfigError(
-            f"This objective compares images of three colours, (height, width, 3), but the targets have the shape "
-            f"{tuple(densities.event_shape)}. Leave out the objective, or choose other data."
+            "An objective for images compares images of three colours, (height, width, 3), but the densities have "
+            f"the event shape {tuple(densities.event_shape)}. Leave this objective out, or choose data whose target "
+            "is an image."
         )
     images = densities.mean
     count, *members = images.shape[:-3]

@@ -105,7 +105,7 @@ def read_vgg(depth: Depth, file: str) -> VGG:
             if tensor is None or tensor.shape != own.shape:
                 state = "missing" if tensor is None else f"of shape {tuple(tensor.shape)}"
                 raise ConfigError(
-                    f"{file}: {key} is {state}, expected the shape {tuple(own.shape)}. Set "
+                    f"{file}: the entry {key} is {state}; expected a tensor of shape {tuple(own.shape)}. Set "
                     f"objective.perceptual.weights to torchvision's weights of VGG{depth}, such as vgg{depth}-….pth."
                 )
             own.copy_(tensor)

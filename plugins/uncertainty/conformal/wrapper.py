@@ -100,9 +100,9 @@ class Conformal(Uncertainty):
         self.remark = coverage_remark(len(scores), self.miscoverage)
         if self.threshold.isinf():
             _log.warning(
-                "conformal: with %d validation samples, no smaller set than all values is certain to miss at most a "
-                "share of %g of the targets, so that every set holds all values. %d samples would be enough, if every "
-                "density gives each target a probability above 0.",
+                "conformal: %d validation samples are too few to choose sets that miss at most a share of %g of the "
+                "targets, so every set holds all values. %d samples are enough if every density gives each target a "
+                "probability above 0.",
                 len(scores),
                 self.miscoverage,
                 math.ceil(1 / self.miscoverage) - 1,
