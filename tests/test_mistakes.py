@@ -119,7 +119,7 @@ experiment=moons/vanilla_128 metric=[accuracy,psnr] | CategoricalDensity of even
 data=moons density_head=extra_trees metric=[psnr] | A metric reads the true 'color' of every image
 objective=[outlier] | Did you mean 'outlier_exposure'?
 renderer=zbufer | Did you mean 'zbuffer'?
-experiment=moons/vanilla_128 density_head=scvae | density_head scvae, which contains
+experiment=moons/vanilla_128 density_head=scvae | density_head scvae cannot be built, because its part
 experiment=pascal3d/scvae density_head=categorical | Choose another plugin for this target, or other data
 experiment=pascal3d/scvae metric=[accuracy] | Choose another plugin for this target, or other data
 experiment=moons/vanilla_128 +data._target_=os.system | must not be able to run code

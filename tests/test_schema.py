@@ -622,7 +622,7 @@ def test_a_constructor_may_refuse_by_a_value_error(config: dict[str, Any], inner
     (line,) = re.findall(rf"\(ValueError at {re.escape(__file__)}:(\d+)\)", told)
     source = Path(__file__).read_text(encoding="utf-8").splitlines()[int(line) - 1]
     assert "Conv2d" in source or "raise ValueError" in source
-    assert told.startswith("encoder toy, which contains inner: ") == inner
+    assert told.startswith("encoder toy cannot be built, because its part `inner` cannot be built: ") == inner
 
 
 def test_plugins_that_no_config_can_name_are_refused() -> None:

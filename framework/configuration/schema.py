@@ -131,7 +131,9 @@ def build(group: str, config: Mapping[str, Any], **context: Any) -> Any:
             else:
                 values[key] = build(part.group, values[key], **context)
         except ConfigError as error:  # the user may not know of the part, which has a default
-            raise ConfigError(f"{group} {config['name']}, which contains {key}: {error}") from error
+            raise ConfigError(
+                f"{group} {config['name']} cannot be built, because its part `{key}` cannot be built: {error}"
+            ) from error
     try:
         return cls(*supplied, **arguments(cls, values))
     except ValueError as error:

@@ -130,7 +130,7 @@ def open_stream(stream: BinaryIO | BytesIO) -> Iterator[Image.Image]:
     try:
         opened = Image.open(stream, formats=FORMATS)
     except UnidentifiedImageError:
-        raise ValueError(f"the content is in none of the formats {', '.join(FORMATS)}") from None
+        raise ValueError(f"the content of the file is in none of the formats {', '.join(FORMATS)}") from None
     with opened as image:
         most = MOST_PIXELS_OF.get(image.format or "", MOST_PIXELS)
         if image.width * image.height > most or max(image.size) > LONGEST_SIDE:

@@ -174,7 +174,8 @@ class _Reader:
             self.arrays += count * max(len(fields), 1)
             if depth == DEEPEST or self.arrays > MOST_ARRAYS:
                 raise ValueError(
-                    f"the file has more than {MOST_ARRAYS} arrays, or arrays nested deeper than {DEEPEST} levels"
+                    f"the file has more than {MOST_ARRAYS} arrays, or arrays nested deeper than {DEEPEST} levels, "
+                    "which is not allowed"
                 )
             values = np.empty(count, object)
             for number in range(count):

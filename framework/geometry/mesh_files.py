@@ -413,7 +413,8 @@ def xyz(content: bytes) -> Parsed:
         return _table(values, None)
     if len(values) and len(names) != values.shape[1]:
         raise ValueError(
-            f"the first line names {len(names)} columns, but each point has {values.shape[1]} numbers"
+            f"the first line names {len(names)} columns, but each point has {values.shape[1]} numbers; expected a "
+            "name for each number"
         )
     text.require_distinct(names)
     more = [name for name in names if name not in XYZ]

@@ -34,7 +34,8 @@ def require_finite(raw: Tensor, shape: int | tuple[int, ...]) -> Tensor:
     ):
         row = tuple((~raw.isfinite().flatten(-len(own)).all(-1)).nonzero()[0].tolist())
         raise NonFiniteParameters(
-            f"The raw parameters are not finite in batch row {row[0] if len(row) == 1 else row}."
+            f"The raw parameters are not finite in batch row {row[0] if len(row) == 1 else row}; expected finite "
+            "numbers. Check the inputs of this row."
         )
     return raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
 

@@ -148,7 +148,7 @@ def collect_files(root: Path, into: Path, part: int) -> Collection:
     if into.resolve().is_relative_to(root.resolve()):
         raise ConfigError(
             f"mode.into={into} lies inside mode.files={root}, so the features would be read as files. Set mode.into "
-            "to a folder outside."
+            "to a folder outside of mode.files."
         )
     paths = (path.relative_to(root) for path in root.rglob("*") if path.is_file())
     names = sorted(

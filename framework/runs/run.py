@@ -111,7 +111,7 @@ def open_run(config: Config) -> Iterator[Run]:
                 sys.stderr.write(f"stopped; continue with: python -m framework {resume_arguments(run)}\n")
             if refused := describe_unwritable(error):
                 raise DataError(
-                    f"{refused} All files of the run are undamaged; {resume_arguments(run)} continues it."
+                    f"{refused} All files of the run are undamaged. Continue the run with {resume_arguments(run)}."
                 ) from error
             raise
         if resumed:

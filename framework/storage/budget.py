@@ -56,13 +56,16 @@ class Budget(TorchDispatchMode):
         keywords = kwargs or {}
         self.calls -= 1
         if self.calls < 0:
-            raise self._refusal("takes far more layers or steps")
+            raise self._refusal("the model takes far more layers or steps than its weights explain")
         size = result_bytes(func, args, keywords)
         if size <= limits.SMALL_RESULT:
             return func(*args, **keywords)
         self.allocated = [(storage, nbytes) for storage, nbytes in self.allocated if not storage.expired()]
         if size + sum(nbytes for _, nbytes in self.allocated) > self.most_bytes:
-            raise self._refusal(f"takes far more memory (at last a tensor of {size / 1e6:.4g} MB)")
+            raise self._refusal(
+                "the model takes far more memory than its weights and inputs explain (at last a tensor of "
+                f"{size / 1e6:.4g} MB)"
+            )
         result = func(*args, **keywords)
         for tensor in tree_iter(result):
             if isinstance(tensor, Tensor) and tensor.layout is torch.strided:
@@ -72,8 +75,7 @@ class Budget(TorchDispatchMode):
 
     def _refusal(self, excess: str) -> CheckpointError:
         return CheckpointError(
-            f"{self.path} describes a model that {excess} than its weights and inputs explain. Training writes no "
-            "such file. Copy the file again from its source."
+            f"{self.path}: {excess}. Training writes no such file. Copy the file again from its source."
         )
 
 

@@ -225,7 +225,8 @@ def from_memory(user_data: Any, columns: InputColumns) -> Float[Tensor, "row col
         rows = to_real(user_data, "the input")
     except (TypeError, ValueError) as error:
         raise DataError(
-            f"{str(error)[:200]}. Give rows of numbers, in the columns {', '.join(columns.names)}."
+            f"The input cannot be read as rows of numbers: {str(error)[:200]}. Give rows of numbers, in the columns "
+            f"{', '.join(columns.names)}."
         ) from error
     rows = as_inputs(rows, (len(columns.names),)).numpy()
     scaled = standardise(rows, columns.scaling)

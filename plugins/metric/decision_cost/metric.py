@@ -214,7 +214,10 @@ def _check_actions(table: list[list[float]], actions: list[str] | None, truths: 
             "decision_cost.costs."
         )
     if len({_key(name) for name in actions}) < count:
-        raise ConfigError(f"got decision_cost.actions = {actions}, but the names of actions must differ.")
+        raise ConfigError(
+            f"got decision_cost.actions = {actions}, but the names of actions must differ. Give each action a name "
+            "of its own."
+        )
     for truth, row in zip(truths, table, strict=True):
         if any(math.isnan(cost) or cost == -math.inf for cost in row):
             raise ConfigError(

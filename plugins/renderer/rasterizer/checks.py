@@ -382,6 +382,7 @@ def check_camera(camera: Camera) -> np.ndarray:
     everything = (*lens, *camera.rotation.reshape(-1).tolist(), *camera.translation.tolist())
     if not all(map(math.isfinite, everything)) or not 0 < camera.near < math.inf or min(lens[:2]) <= 0:
         raise ValueError(
-            f"the camera has a number that is not finite, or a focal or near that is not above 0: {camera}."
+            f"got a camera with a number that is not finite, or with a focal or near that is not above 0: {camera}. "
+            "Correct these numbers."
         )
     return np.array(lens)

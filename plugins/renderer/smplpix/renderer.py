@@ -178,7 +178,9 @@ def colored_points(scene: Scene) -> Float[Tensor, "points 6"]:
 
 def _check_scene(scene: Scene, channels: Collection[str]) -> None:
     if unknown := set(channels) - SMPLpix.channels:
-        raise ValueError(f"got the channels {', '.join(sorted(unknown))}, but SMPLpix draws only color.")
+        raise ValueError(
+            f"got the channels {', '.join(sorted(unknown))}, but SMPLpix draws only color. Request only color."
+        )
     if not channels:
         return
     scene.camera.check_shapes()
