@@ -104,8 +104,9 @@ def plain(config: DictConfig) -> dict[str, Any]:
     for group in GLOBAL:
         if group in values:
             raise ConfigError(
-                f"The config chosen as {group} sets nothing at the top level. Its first line must be "
-                f"`# @package _global_`, because Hydra puts its keys under `{group}` otherwise; keys and values follow."
+                f"The config chosen as {group} sets nothing at the top level. Its first line must be `# @package "
+                f"_global_`, because Hydra puts its keys under `{group}` otherwise. Keys and values must follow this "
+                "line."
             )
     for group in PLURAL:
         chosen = values.get(group) or {}

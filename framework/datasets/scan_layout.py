@@ -328,9 +328,9 @@ def read_places(root: Path, topology: str) -> TexturePlaces:
         fits = fits and np.isfinite(places.uv).all()
         if not fits or places.uv_faces.min() < 0 or places.uv_faces.max() >= len(places.uv):
             raise ValueError(
-                f"the shapes are faces {places.faces.shape}, uv_faces {places.uv_faces.shape} and uv "
-                f"{places.uv.shape}; expected (faces, 3) twice, finite uv (coordinates, 2), and row numbers of uv in "
-                "uv_faces"
+                f"the arrays have wrong shapes or values: faces {places.faces.shape}, uv_faces "
+                f"{places.uv_faces.shape}, uv {places.uv.shape}; expected (faces, 3) for both faces, finite uv "
+                "(coordinates, 2), and rows of uv in uv_faces"
             )
     return places
 

@@ -159,8 +159,8 @@ def require_unique_name(owners: "dict[str, Metric]", name: str, metric: "Metric"
     other = owners.setdefault(name, metric)
     if other is not metric:
         raise ConfigError(
-            f"Two metrics use the name {name!r}: {type(other).__name__} and {type(metric).__name__}. Leave one of them "
-            "out; mode=test computes it for the same model."
+            f"Two metrics use the name {name!r}: {type(other).__name__} and {type(metric).__name__}. Leave one of "
+            "them out, and compute it with mode=test for the same model."
         )
 
 

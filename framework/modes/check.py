@@ -67,8 +67,8 @@ def run(config: Config) -> None:
     console.print(f"all findings: {config.folder / 'check.csv'}", soft_wrap=True)
     if failed:
         raise ContractBroken(
-            f"{len(failed)} of {len(lines)} checks failed: {', '.join(dict.fromkeys(failed))}. "
-            "The tables name the cases; the docstring of the base class in framework/ states the contract."
+            f"{len(failed)} of {len(lines)} checks failed: {', '.join(dict.fromkeys(failed))}. The tables above name "
+            "the cases in which they failed; the docstring of the base class in framework/ states the contract."
         )
 
 

@@ -322,8 +322,8 @@ def _common_size(root: Path, subjects: Sequence[Subject]) -> tuple[tuple[int, in
         folder = root / "subjects" / subject.name
         if (other := len(subject.mesh.vertices)) != points:
             raise DataError(
-                f"{folder}: the registration has {other} vertices, but that of {first.name} has {points}; expected the "
-                "same topology for all subjects."
+                f"{folder}: the registration has {other} vertices, but that of {first.name} has {points}; expected "
+                "the same topology for all subjects. Copy the registration again from its source."
             )
         for view in subject.views:
             if (other := (view.camera.height, view.camera.width)) != size:

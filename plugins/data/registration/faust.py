@@ -98,7 +98,7 @@ def pairs(folder: Path, challenge: Challenge) -> list[Pair]:
         scan_pairs.append(pair)
     if not scan_pairs:
         raise DataError(
-            f"{file}: the list contains no pair; expected two test scans a line, such as 000_001."
+            f"{file}: the list contains no pair; expected two test scans in each line, such as 000_001."
         )
     return scan_pairs
 
