@@ -330,5 +330,5 @@ def test_aggregate_refuses_runs_that_are_not_independent() -> None:
 
 
 def test_aggregate_names_a_key_that_is_missing() -> None:
-    with pytest.raises(ConfigError, match="lacks 'seed'"):
+    with pytest.raises(ConfigError, match="lacks the key 'seed'"):
         aggregate([{"method": "a"}], ["method"])

@@ -77,7 +77,7 @@ def volume_with(**changes):
         (volume_with(spectra=np.full((4, 5, 6), np.nan)), "None of the 20 voxels"),
         (volume_with(spectra=np.full((4, 5, 6), 900.0)), "not divided by M0"),
         (volume_with(mask=np.zeros((4, 5))), "The mask contains no voxel"),
-        (volume_with(region=np.full((4, 5), 7)), "numbers 7 to 7"),
+        (volume_with(region=np.full((4, 5), 7)), "numbers from 7 to 7"),
     ],
 )
 def test_the_message_about_a_bad_volume_names_the_fault(arrays, message, tmp_path):
