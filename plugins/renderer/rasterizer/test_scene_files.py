@@ -283,7 +283,7 @@ def test_the_wrap_rule_of_a_texture_is_read(
     file = write_scene(tmp_path, content, [CORNERS, (reach * UV).astype("<f4"), ORDER, arrays[3]])
     if wanted is None:
         with pytest.raises(
-            DataError, match=r"one\.glb: the textures continue .*\(clamp, mirror\), but a scene"
+            DataError, match=r"one\.glb: the textures of the scene continue .*\(clamp, mirror\), but a scene"
         ):
             read(file)
         return
