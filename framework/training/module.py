@@ -103,6 +103,18 @@ class Training(pl.LightningModule):
         else:
             super().__setattr__(name, value)
 
+    # Lightning would look for these hooks in the model and in the loaders at every step, which takes 0.06 ms.
+    def _on_before_batch_transfer(self, batch: Batch, dataloader_idx: int = 0) -> Batch:
+        return batch
+
+    def _apply_batch_transfer_handler(
+        self, batch: Batch, device: torch.device | None = None, dataloader_idx: int = 0
+    ) -> Batch:
+        device = device or self.device
+        if device.type == "cpu":
+            return batch
+        return {name: tensor.to(device, non_blocking=True) for name, tensor in batch.items()}
+
     @property
     def learner(self) -> Predictor:
         """Predictor that reads the batches; with cached features, it is the one inside the `FrozenFrontEnd`."""
