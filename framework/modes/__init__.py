@@ -16,6 +16,7 @@ from framework.errors import ConfigError, did_you_mean
 from framework.runs.job import PARENT, refuse_idle
 from framework.storage.enclosed import require_enclosed
 from framework.storage.first_rank import first_rank
+from framework.storage.imports import without_collection
 from framework.tracking.store_process import started_early
 
 
@@ -44,11 +45,13 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
         require_read(name, overrides)
         for sentence in idle_sentences(values, overrides):
             refuse_idle(folder, sentence)
-    if name == "train":  # find mistakes before the slow import of Lightning
-        require_device(config.settings.trainer.get("accelerator"))
-        _ = config.assembly
     with started_early() if _sends_run(config) else nullcontext():
-        return import_module(f"framework.modes.{name}").run(config)
+        with without_collection():
+            if name == "train":  # find mistakes before the slow import of Lightning
+                require_device(config.settings.trainer.get("accelerator"))
+                _ = config.assembly
+            mode = import_module(f"framework.modes.{name}")
+        return mode.run(config)
 
 
 def _sends_run(config: Config) -> bool:

@@ -19,6 +19,7 @@ from typing import Any, BinaryIO, final
 from pydantic import TypeAdapter
 
 from framework.errors import DataError
+from framework.storage.imports import without_collection
 from framework.tracking.run_info import RunInfo
 from framework.tracking.sender import Record, Store, reason
 
@@ -185,7 +186,7 @@ def main() -> None:
     os.dup2(2, 1)
     # MLflow works without these packages, whose import takes a third of the time, as long as it reads no data
     sys.modules.update(dict.fromkeys(("numpy", "pandas", "pyarrow")))  # type: ignore[arg-type]
-    with suppress(Exception):  # `serve` raises the same error, and reports it
+    with without_collection(), suppress(Exception):  # `serve` raises the same error, and reports it
         import_module("framework.tracking.mlflow_store")
     serve(sys.stdin.buffer, responses)
     sys.stderr.flush()
