@@ -5,7 +5,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -106,6 +107,20 @@ def cores_used_by_others(seconds: float = 2.0) -> float:
     before, own = _total_processor_seconds(), time.process_time()
     time.sleep(seconds)
     return max(0.0, (_total_processor_seconds() - before - (time.process_time() - own)) / seconds)
+
+
+@contextmanager
+def busy_core(wanted: bool) -> Iterator[None]:
+    """Keep one core busy by another process during the block, if `wanted` is true."""
+    if not wanted:
+        yield
+        return
+    process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
 
 
 def first_calls(script: str, **variables: str) -> tuple[float, float]:

@@ -2,92 +2,67 @@
 
     python -m benchmarks.framework.step_overhead
 
-All loops use the same batches, fused optimiser and gradient clipping. They run one after the other in one process. One
-plain loop trains this framework's model, the other trains the same network and loss written in plain PyTorch. The
-script writes step_overhead.md beside this file.
+The framework's steps are those of its command, and their times are read from the journal of the run. The plain loops
+use the same numbers of samples, the same batch size, fused optimiser and gradient clipping. The script writes
+step_overhead.md beside this file.
 """
 
-import logging
+import json
+import os
+import subprocess
+import sys
 import tempfile
 import time
-import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pytorch_lightning as pl
 import torch
 from torch import Tensor, nn
 
+from benchmarks.commands import ROOT
 from benchmarks.pages import machine, publish
 from benchmarks.timing import Rounds, require_idle
 from framework.configuration.assembly import assemble, build_predictor
 from framework.configuration.schema import build, resolve
-from framework.configuration.settings import OptimizerSettings, Settings
-from framework.data import Batch, Splits
-from framework.datasets.fields import Fields
+from framework.configuration.settings import Settings
 from framework.model import Predictor
 from framework.target import Target
-from framework.tracking.signals import Stopper
-from framework.tracking.tracker import NoTracker
-from framework.training.batches import Batches
-from framework.training.module import (
-    OPTIMIZERS,
-    KeepCheckpoints,
-    LoadedBatches,
-    LogMetrics,
-    StopAtBatch,
-    Training,
-)
+from framework.training.module import OPTIMIZERS
 
-ROUNDS = 7
+ROUNDS = 5
+QUIET = ("threads=1", "logger=none", "pictures=false")
+"""Settings of the command in every case: one thread, and nothing beside the training that could disturb its times."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A model, its training data, and the same network and loss in plain PyTorch."""
+    """A training of the framework, and the same network, loss and numbers of samples for the plain loops.
+
+    Attributes:
+        name: Name in the table.
+        command: Settings of the command.
+        parts: Data set, encoder and density head of the predictor in the second plain loop.
+        target: Target of the predictor.
+        plain: Function that returns the network with its loss in plain PyTorch.
+        samples: Function that returns inputs and targets.
+        batch: Number of samples of a batch.
+        epochs: Number of epochs.
+        optimizer: Name of the optimiser.
+        clip: Largest norm of the gradient; None: gradients are not clipped.
+    """
 
     name: str
-    config: dict[str, Any]
-    data: "InMemoryData"
-    batch: int
+    command: tuple[str, ...]
+    parts: dict[str, Any]
+    target: Target
     plain: Callable[[], nn.Module]
-
-    @property
-    def steps(self) -> int:
-        """Number of steps in an epoch."""
-        return len(self.data.fields) // self.batch
-
-
-class InMemoryData:
-    """Training samples in memory."""
-
-    def __init__(self, target: Target, inputs: Tensor, labels: Tensor) -> None:
-        self.inputs, self.labels = inputs, labels
-        self.target, self.input_shape = target, tuple(inputs.shape[1:])
-        self.fields = Fields(input=inputs, target=labels, index=torch.arange(len(inputs)))
-
-    def splits(self) -> Splits:
-        return Splits(self.fields, self.fields, self.fields)
-
-    def augment(self, batch: Batch) -> Batch:
-        return batch
-
-
-def crops() -> InMemoryData:
-    """Return random images of the same shape as in the main experiment, with three random angles each."""
-    generator = torch.Generator().manual_seed(0)
-    images = torch.randint(0, 256, (64 * 40, 3, 48, 48), dtype=torch.uint8, generator=generator)
-    target = Target("angle", ("azimuth", "elevation", "tilt"))
-    return InMemoryData(target, images, torch.rand(len(images), 3, generator=generator))
-
-
-def points() -> InMemoryData:
-    """Return random points of the plane in two classes, of the same shape as the data set moons."""
-    generator = torch.Generator().manual_seed(0)
-    inputs = torch.randn(50 * 400, 2, generator=generator)
-    return InMemoryData(Target("class", ("first", "second")), inputs, (inputs[:, 0] > 0).long())
+    samples: Callable[[], tuple[Tensor, Tensor]]
+    batch: int
+    epochs: int
+    optimizer: str
+    clip: float | None
 
 
 class PlainBiternion(nn.Module):
@@ -125,141 +100,156 @@ class PlainMoons(nn.Module):
         )
 
 
-def time_plain_loop(model: nn.Module, loss: Callable[[Tensor], Tensor], case: Case) -> float:
+def points(count: int) -> tuple[Tensor, Tensor]:
+    """Return random points of the plane in two classes."""
+    generator = torch.Generator().manual_seed(0)
+    inputs = torch.randn(count, 2, generator=generator)
+    return inputs, (inputs[:, 0] > 0).long()
+
+
+def crops(count: int) -> tuple[Tensor, Tensor]:
+    """Return random images of the shape of the main experiment, with three random angles each."""
+    generator = torch.Generator().manual_seed(0)
+    images = torch.randint(0, 256, (count, 3, 48, 48), dtype=torch.uint8, generator=generator)
+    return images, torch.rand(count, 3, generator=generator)
+
+
+MOONS_PARTS = {
+    "data": "moons",
+    "encoder": {"mlp": {"name": "mlp", "widths": [128, 128]}},
+    "density_head": "bernoulli",
+    "metric": {},
+}
+PASCAL_PARTS = {
+    "data": "pascal3d",
+    "encoder": {"biternion_vgg": {"name": "biternion_vgg"}},
+    "density_head": "von_mises",
+    "metric": {},
+}
+MOONS = Target("class", ("first", "second"))
+CASES = (
+    Case(
+        "`moons/vanilla_128`: mlp of 2 × 128 + bernoulli, batches of 100, 5 steps an epoch",
+        ("experiment=moons/vanilla_128", "trainer.check_val_every_n_epoch=200", "trainer.max_epochs=200"),
+        MOONS_PARTS, MOONS, PlainMoons, lambda: points(500), 100, 200, "adam", None,
+    ),
+    Case(
+        "`moons/vanilla_128 data.train=100000`: the same, 1,000 steps an epoch",
+        ("experiment=moons/vanilla_128", "data.train=100000", "trainer.max_epochs=1"),
+        MOONS_PARTS, MOONS, PlainMoons, lambda: points(100_000), 100, 1, "adam", None,
+    ),
+    Case(
+        "`pascal3d/von_mises data.mirror=false data.jitter=0`: biternion_vgg + von_mises, batches of 16",
+        ("experiment=pascal3d/von_mises", "data.mirror=false", "data.jitter=0", "trainer.max_epochs=1"),
+        PASCAL_PARTS, Target("angle", ("azimuth", "elevation", "tilt")), PlainBiternion, lambda: crops(16 * 75), 16, 1,
+        "adamw", 1.0,
+    ),
+)  # fmt: skip
+
+
+def time_plain_loop(
+    parameters: Sequence[nn.Parameter], loss: Callable[[Tensor, Tensor], Tensor], case: Case
+) -> float:
     """Return the milliseconds a step of a plain PyTorch loop.
 
     Args:
-        model: Model that is trained.
-        loss: Function that returns the loss of a batch from the indices of its samples.
-        case: Training data and batch size.
+        parameters: Parameters that are trained.
+        loss: Function that returns the loss of a batch, a scalar.
+        case: Training data and settings.
     """
-    optimizer = OPTIMIZERS["adamw"](model.train().parameters(), lr=1e-3)
-    order = torch.randperm(len(case.data.fields)).split(case.batch)
+    inputs, target = case.samples()
+    optimizer = OPTIMIZERS[case.optimizer](parameters, lr=1e-3, fused=True)
+    steps = 0
     start = time.perf_counter()
-    for rows in order:
-        optimizer.zero_grad()
-        loss(rows).backward()
-        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-        optimizer.step()
-    return 1e3 * (time.perf_counter() - start) / len(order)
+    for _ in range(case.epochs):
+        for rows in torch.randperm(len(inputs)).split(case.batch):
+            optimizer.zero_grad()
+            loss(inputs[rows], target[rows]).backward()
+            if case.clip is not None:
+                nn.utils.clip_grad_norm_(parameters, case.clip)
+            optimizer.step()
+            steps += 1
+    return 1e3 * (time.perf_counter() - start) / steps
 
 
 def time_plain_model(case: Case) -> float:
     """Return the milliseconds a step of a plain loop that trains the model in plain PyTorch."""
-    model, inputs, target = case.plain(), case.data.inputs, case.data.labels
-    return time_plain_loop(model, lambda rows: model(inputs[rows], target[rows]), case)
+    model = case.plain().train()
+    return time_plain_loop(list(model.parameters()), model, case)
 
 
 def time_predictor(case: Case) -> float:
     """Return the milliseconds a step of a plain loop that trains this framework's model."""
-    model, inputs, target = build_case_predictor(case), case.data.inputs, case.data.labels
-    return time_plain_loop(model, lambda rows: model.loss(inputs[rows], target[rows]).mean(), case)
-
-
-def build_case_predictor(case: Case) -> Predictor:
-    return build_predictor(
-        assemble(Settings.of(case.config)).parts, case.data.target, case.data.input_shape, seed=0
+    shape = tuple(case.samples()[0].shape[1:])
+    model: Predictor = build_predictor(assemble(Settings.of(case.parts)).parts, case.target, shape, seed=0)
+    return time_plain_loop(
+        list(model.train().parameters()), lambda inputs, target: model.loss(inputs, target).mean(), case
     )
 
 
-class Clock(pl.Callback):
-    """Clock that measures the wall time from the start of an epoch to the end of its last batch."""
-
-    def on_train_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        self.start = time.perf_counter()
-
-    def on_train_batch_end(self, *arguments: object, **more: object) -> None:
-        self.end = time.perf_counter()
-
-
 def time_framework(case: Case) -> float:
-    """Return the milliseconds a step of the framework's training, including journal and callbacks."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        predictor = build_case_predictor(case)
-        training = Training(predictor, [], case.data, OptimizerSettings(name="adamw"), 0, {})  # type: ignore[arg-type]
-        batches = Batches(case.data, batch_size=case.batch, workers=0, seed=0)  # type: ignore[arg-type]
-        tracker = NoTracker(folder)
-        tracker.open()
-        keep = KeepCheckpoints(folder, None)
-        clock = Clock()
-        trainer = pl.Trainer(
-            max_epochs=1,
-            accelerator="cpu",
-            logger=False,
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            limit_val_batches=0,
-            gradient_clip_val=1.0,
-            use_distributed_sampler=False,
-            callbacks=[LogMetrics(tracker, 10), StopAtBatch(Stopper(), keep), clock],
-        )
-        trainer.fit(training, datamodule=LoadedBatches(batches, trainer))
-        tracker.close("FINISHED")
-    return 1e3 * (clock.end - clock.start) / case.steps
+    """Return the milliseconds a step of the framework's command."""
+    return time_steps((*case.command, *QUIET))
 
 
-def make_config(data: str, encoder: str, head: str, **more: Any) -> dict[str, Any]:
-    return {
-        "data": data,  # only decides the kind of target; the batches come from memory
-        "encoder": {encoder: {"name": encoder, **more}},
-        "density_head": head,
-        "metric": {},
-    }
+def time_steps(settings: Sequence[str], **variables: str) -> float:
+    """Return the milliseconds a step of a training command, from the times in the journal of its run.
+
+    Args:
+        settings: Settings of the command.
+        variables: Additional environment variables.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        subprocess.run(
+            [sys.executable, "-m", "framework", *settings, f"hydra.run.dir={folder}"],
+            cwd=ROOT, check=True, stdout=subprocess.DEVNULL, env={**os.environ, **variables},
+        )  # fmt: skip
+        lines = [json.loads(line) for line in (Path(folder) / "journal.jsonl").read_text().splitlines()]
+    steps = [(line["step"], line["time"]) for line in lines if "train/loss" in line.get("values", ())]
+    (first_step, start), (last_step, end) = steps[0], steps[-1]
+    return 1e3 * (end - start) / (last_step - first_step)
 
 
 def main() -> None:
     torch.set_num_threads(1)
     require_idle()
-    warnings.filterwarnings("ignore")
-    logging.getLogger("pytorch_lightning").setLevel(logging.ERROR)
-    cases = [
-        Case(
-            "biternion_vgg + von_mises, 3 × 48 × 48, batch 64",
-            make_config("pascal3d", "biternion_vgg", "von_mises"), crops(), 64, PlainBiternion,
-        ),
-        Case(
-            "mlp of 2 × 128 + bernoulli (`moons/vanilla_128`), batch 50",
-            make_config("moons", "mlp", "bernoulli", widths=[128, 128]), points(), 50, PlainMoons,
-        ),
-    ]  # fmt: skip
     loops = {
         "plain loop, plain model": time_plain_model,
         "plain loop, framework's model": time_predictor,
-        "framework": time_framework,
+        "framework's command": time_framework,
     }
     rows = []
-    for case in cases:
-        rounds_of_loops = [[loop(case) for loop in loops.values()] for _ in range(ROUNDS + 1)][
-            1:
-        ]  # the first round warms up
+    for case in CASES:
+        rounds_of_loops = [[loop(case) for loop in loops.values()] for _ in range(ROUNDS)]
         times = {
             name: Rounds(tuple(column))
             for name, column in zip(loops, zip(*rounds_of_loops, strict=True), strict=True)
         }
-        cells = [rounds.text() for rounds in times.values()]
-        ratios = [times[name].times_faster(times["framework"], 3) for name in list(loops)[:2]]
-        rows.append(f"| {' | '.join([case.name, *cells, *ratios])} |")
+        *plain, framework = times.values()
+        ratios = [framework_ratio.times_faster(framework, 3) for framework_ratio in plain]
+        rows.append(f"| {' | '.join([case.name, *(rounds.text() for rounds in times.values()), *ratios])} |")
     text = "\n".join(
         [
             "# Training step: run time of the framework and of plain PyTorch loops",
             "",
-            "This page compares the time of a training step in this framework with the time of a step in a plain "
+            "This page compares the time of a training step of this framework with the time of a step in a plain "
             "PyTorch loop. The difference is what the framework itself costs.",
             "",
-            "Three loops train each model on generated data. `plain loop, plain model` is a PyTorch loop with a "
-            "network and a loss that are written in plain PyTorch. `plain loop, framework's model` is the same loop "
-            "with the same network as a model of this framework. `framework` is the training of this framework, "
-            "including its journal and callbacks. All loops use the same batches, the fused AdamW optimiser and "
-            "gradient clipping.",
+            "The column `framework's command` is the training of `python -m framework` with the settings in the first "
+            f"column and `{' '.join(QUIET)}`. Its times are those in the journal of the run: the time between the "
+            "first and the last logged step, divided by the number of steps. They include everything that the "
+            "framework does at a step and between two epochs, such as reading batches, callbacks, schedules and the "
+            "journal. `plain loop, plain model` is a PyTorch loop with a network and a loss that are written in plain "
+            "PyTorch. `plain loop, framework's model` is the same loop with the same network as a model of this "
+            "framework. The plain loops use the same number of samples, batch size, fused optimiser and clipping of "
+            "gradients.",
             "",
             f"Each time is the median of {ROUNDS} rounds (least to largest) of wall time on one thread. The loops "
-            "alternate in one process. The last two columns hold the framework's time divided by the time of a plain "
-            "loop. A ratio of 1 means that the framework costs no time.",
+            "alternate. The last two columns hold the framework's time divided by the time of a plain loop. A ratio of "
+            "1 means that the framework costs no time.",
             "",
-            f"| model | {', ms a step | '.join(loops)}, ms a step | ratio to plain loop, plain model | ratio to plain "
-            "loop, framework's model |",
+            f"| training | {', ms a step | '.join(loops)}, ms a step | ratio to plain loop, plain model | ratio to "
+            "plain loop, framework's model |",
             "|---|---:|---:|---:|---:|---:|",
             *rows,
             "",

@@ -1,0 +1,247 @@
+"""Measure the parts of the main job, `experiment=pascal3d/scvae`, and its error, before and after a change.
+
+    python -m benchmarks.framework.main_job --before <commit>
+
+The whole measurement takes half an hour. It can be done in pieces, such as `--seeds 0,1`, `--epochs 3`, `--beside` and
+`--runs after:32-true`. Each piece replaces its rows in main_job.csv, and the page main_job.md is written from all rows.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.commands import ROOT
+from benchmarks.pages import machine, publish, read_rows
+from benchmarks.timing import busy_core, median_and_range, require_idle
+from framework.reports.table import write_csv
+
+BEFORE = "950f55d"
+RUNS = "before:32-true,after:32-true,after:bf16-mixed"
+TABLE = Path(__file__).with_suffix(".csv")
+FULL = 30
+"""Number of epochs of the main job."""
+PARTS = {
+    "start": "start of the command to the first logged step",
+    "training": "training: first to last logged step",
+    "curve": "last validation, training curve, calibration and model",
+    "test": "test and cost",
+    "figures": "figures",
+    "end": "closing: waiting for the tracking store, end of the process",
+}
+STEP = "a step with its share of validations and checkpoints, ms"
+ERRORS = {"log_likelihood": "log-likelihood, nats", "maad_deg": "MAAD, °"}
+
+
+@contextmanager
+def source(commit: str | None) -> Iterator[Path]:
+    """Yield the folder of the project at a commit, in a temporary work tree; None: the folder of this script."""
+    if commit is None:
+        yield ROOT
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        tree = Path(folder) / "tree"
+        git = ["git", "-C", str(ROOT), "worktree"]
+        subprocess.run([*git, "add", "--detach", str(tree), commit], check=True, capture_output=True)
+        try:
+            yield tree
+        finally:
+            subprocess.run([*git, "remove", "--force", str(tree)], check=True, capture_output=True)
+
+
+@dataclass(frozen=True)
+class Done:
+    """A command of the framework that has ended.
+
+    Attributes:
+        start: Time at which it started, seconds since 1970.
+        wall: Wall time, seconds.
+        processor: Processor time of all its processes, seconds.
+        lines: Lines of the journal of its run.
+        results: Content of results.json.
+    """
+
+    start: float
+    wall: float
+    processor: float
+    lines: list[dict[str, Any]]
+    results: dict[str, Any]
+
+
+def run_command(tree: Path, settings: Sequence[str]) -> Done:
+    """Run a command with the version of the framework in a folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder) / "outputs" / "run"
+        start, clock = time.time(), time.perf_counter()
+        process = subprocess.Popen(
+            [sys.executable, "-m", "framework", *settings, f"hydra.run.dir={run}"],
+            cwd=tree, stdout=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": str(tree)},
+        )  # fmt: skip
+        _, status, usage = os.wait4(process.pid, 0)
+        wall = time.perf_counter() - clock
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            raise subprocess.CalledProcessError(process.returncode, settings)
+        lines = [json.loads(line) for line in (run / "journal.jsonl").read_text().splitlines()]
+        results = json.loads((run / "results.json").read_text())
+    return Done(start, wall, usage.ru_utime + usage.ru_stime, lines, results)
+
+
+def run_job(tree: Path, seed: int, precision: str, epochs: int) -> dict[str, Any]:
+    """Run the main job with the version in a folder, and return its times, in seconds, and its errors."""
+    settings = ["experiment=pascal3d/scvae", f"seed={seed}", f"trainer.precision={precision}"]
+    done = run_command(tree, [*settings, *[f"trainer.max_epochs={epochs}"] * (epochs != FULL)])
+    times = [done.start, *part_ends(done.lines), done.start + done.wall]
+    parts = {name: after - before for name, before, after in zip(PARTS, times[:-1], times[1:], strict=True)}
+    steps = [line["step"] for line in done.lines if "train/loss" in line.get("values", ())]
+    return {
+        "wall": done.wall,
+        "processor": done.processor,
+        **parts,
+        "step_milliseconds": 1e3 * parts["training"] / (steps[-1] - steps[0]),
+        **{key: done.results[key] for key in ERRORS},
+    }
+
+
+def part_ends(lines: Sequence[dict[str, Any]]) -> list[float]:
+    """Return the times, seconds since 1970, at which all parts but the last end, from the lines of a journal."""
+
+    def times(fits: Callable[[dict[str, Any]], bool]) -> list[float]:
+        return [line["time"] for line in lines if fits(line)]
+
+    steps = times(lambda line: "train/loss" in line.get("values", ()))
+    model = times(lambda line: str(line.get("artifact", "")).endswith("model.ckpt"))
+    results = times(lambda line: line.get("artifact") == "results.json")
+    status = times(lambda line: line.get("status") == "FINISHED")
+    return [steps[0], steps[-1], model[-1], results[-1], status[-1]]
+
+
+def measure(chosen: argparse.Namespace) -> list[dict[str, Any]]:
+    """Run the main job once for each seed and each choice of version and precision, seed after seed."""
+    rows = []
+    with source(chosen.before) as before:
+        for seed in chosen.seeds:
+            for version, precision in chosen.runs:
+                with busy_core(chosen.beside):
+                    result = run_job(before if version == "before" else ROOT, seed, precision, chosen.epochs)
+                key = {"version": version, "precision": precision, "epochs": chosen.epochs, "seed": seed}
+                rows.append({**key, "beside": chosen.beside, **result})
+                sys.stderr.write(f"{rows[-1]}\n")
+    return rows
+
+
+def identity(row: dict[str, Any]) -> tuple[object, ...]:
+    return tuple(row[key] for key in ("version", "precision", "epochs", "seed", "beside"))
+
+
+def grouped(rows: Sequence[dict[str, Any]]) -> dict[tuple[str, str], list[dict[str, Any]]]:
+    """Return the rows by version and precision."""
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row["version"], row["precision"]), []).append(row)
+    return groups
+
+
+def parts_table(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the table of the parts' times, with a column for each version and precision."""
+    groups = grouped(rows)
+    columns = {"wall": "whole command, wall time, s", **{key: f"{name}, s" for key, name in PARTS.items()}}
+    columns |= {"processor": "whole command, processor time, s", "step_milliseconds": STEP}
+    return [
+        f"| part | {' | '.join(f'{version}, {precision}' for version, precision in groups)} |",
+        f"|---|{'---:|' * len(groups)}",
+        *(
+            f"| {name} | {' | '.join(median_and_range([row[key] for row in group]) for group in groups.values())} |"
+            for key, name in columns.items()
+        ),
+    ]
+
+
+def error_table(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the table of errors beside run times, over the seeds."""
+    lines = [
+        f"| version | precision | seeds | {' | '.join(ERRORS.values())} | wall time, s | processor time, s |",
+        f"|---|---|---:|{'---:|' * (len(ERRORS) + 2)}",
+    ]
+    for (version, precision), group in grouped(rows).items():
+        errors = [mean_and_deviation([row[key] for row in group]) for key in ERRORS]
+        times = [median_and_range([row[key] for row in group]) for key in ("wall", "processor")]
+        lines.append(f"| {' | '.join([version, precision, str(len(group)), *errors, *times])} |")
+    return lines
+
+
+def mean_and_deviation(numbers: Sequence[float]) -> str:
+    """Return the mean and, for several numbers, their standard deviation as text."""
+    text = f"{statistics.mean(numbers):.3f}"
+    return f"{text} ± {statistics.stdev(numbers):.3f}" if len(numbers) > 1 else text
+
+
+def page(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the text of the page."""
+    lines = [
+        "# The main job: run time of its parts, and its error",
+        "",
+        "The main job is `python -m framework experiment=pascal3d/scvae` with all its default settings: it trains an "
+        "sCVAE on generated images of cars, tests it, draws its figures and sends the run to MLflow. This page says "
+        "how long each part takes, and whether a faster run has the same error. `before` is the version of commit "
+        f"`{BEFORE}`, which trains in float32 (`32-true`) with two threads. `after` is this version, which trains with "
+        "one thread, in float32 by default and in bfloat16 with `trainer.precision=bf16-mixed`. The value `auto` means "
+        "`bf16-mixed` on a processor that multiplies bfloat16 numbers fast.",
+        "",
+        "Wall time and processor time are those of the whole command with all its processes. The times of the parts "
+        "are differences of times in the journal of the run. Each cell is the median over the seeds (least to "
+        "largest), which are the rounds: in each round, the versions run one after the other. Errors are the mean "
+        "over the seeds ± their standard deviation.",
+    ]
+    for epochs in sorted({row["epochs"] for row in rows}, reverse=True):
+        form = (
+            "full form" if epochs == FULL else f"shortened to {epochs} epochs (`trainer.max_epochs={epochs}`)"
+        )
+        for beside in (False, True):
+            chosen = [row for row in rows if row["epochs"] == epochs and row["beside"] is beside]
+            where = ", beside a process that keeps one core busy" if beside else ""
+            if chosen:
+                lines += ["", f"## {form[0].upper()}{form[1:]}{where}", "", *parts_table(chosen)]
+                lines += ["", *error_table(chosen)]
+    command = f"`python -m benchmarks.framework.main_job --before {BEFORE}`"
+    lines += ["", f"{machine('torch', 'pytorch-lightning', 'mlflow')} Command: {command}.", ""]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--before", default=BEFORE, help="commit to compare with")
+    parser.add_argument(
+        "--seeds", default="0,1,2,3,4", type=lambda text: [int(seed) for seed in text.split(",")]
+    )
+    parser.add_argument(
+        "--runs",
+        default=RUNS,
+        help="versions and precisions",
+        type=lambda text: [run.split(":") for run in text.split(",")],
+    )
+    parser.add_argument("--epochs", default=FULL, type=int)
+    parser.add_argument("--beside", action="store_true", help="run beside a process that keeps one core busy")
+    parser.add_argument("--write", action="store_true", help="only write the page from main_job.csv again")
+    chosen = parser.parse_args()
+    rows = {identity(row): row for row in (read_rows(TABLE) if TABLE.exists() else [])}
+    if not chosen.write:
+        require_idle()
+        rows |= {identity(row): row for row in measure(chosen)}
+        write_csv(list(rows.values()), None, TABLE)
+    publish(__file__, page(list(rows.values())))
+
+
+if __name__ == "__main__":
+    main()
