@@ -54,7 +54,7 @@ def walk(run: str, file: Path, subject: str) -> tuple[Images, list[Scene]]:
     ways = {
         "mesh, 1 sample": build_renderer("rasterizer"),
         "mesh, 4 × 4 samples": build_renderer("rasterizer", supersampling=4),
-        "SMPLpix": build_renderer("smplpix", checkpoint=run),
+        "SMPLpix": build_renderer("smplpix", checkpoint=run, precision="trained"),
     }
     images: Images = {name: [] for name in (*ways, "photograph")}
     scenes = [who.scene(moment, camera) for moment, camera in zip(moments, cameras, strict=True)]
@@ -131,7 +131,7 @@ def rates(run: str, scene: Scene) -> list[str]:
         [scene.camera.to_canonical(scene.vertices), srgb_from_linear(scene.colors)], 1
     ).numpy()[None]
     loaded, frozen = framework.load(run), framework.freeze(run)
-    renderer = build_renderer("smplpix", checkpoint=run)
+    renderer = build_renderer("smplpix", checkpoint=run, precision="trained")
 
     @torch.no_grad()
     def predicted() -> object:
