@@ -75,7 +75,7 @@ trainer.keep=beest | Did you mean 'best'?
 +trainer.accumulate_grad_batches=0 | trainer.accumulate_grad_batches = 0
 +trainer.deterministic=maybe | trainer.deterministic = 'maybe'
 +trainer.max_time=soon | trainer.max_time = 'soon'
-mode=check checkpoint=outputs/run | mode=check reads no checkpoint; train, test, calibrate, predict, export, work_precision do
+mode=check checkpoint=run | mode=check reads no checkpoint; train, test, calibrate, predict, export, work_precision do
 experiment=moons/vanilla_128 checkpoint=outputs/run | outputs/run is neither a file, a folder nor an MLflow run id
 seed=-1 | seed = -1
 seed=one | seed = 'one'
