@@ -25,12 +25,12 @@ from torch import Tensor
 import framework
 from benchmarks.pages import machine, write_page
 from benchmarks.rendering.builders import build_renderer
-from framework.configuration.loading import find_checkpoint, read_stored
+from framework.configuration.loading import find_checkpoint, read_stored, training_data
 from framework.figures.style import titled_figure
 from framework.geometry.srgb import bytes_from_linear, srgb_from_linear
 from framework.renderer import Scene
 from plugins.data.human_scans import flow
-from plugins.data.human_scans.animate import SPEED, data_of, follow_motion, generated_person
+from plugins.data.human_scans.animate import SPEED, follow_motion, generated_person
 from plugins.data.human_scans.animation import on_white, orbit, photograph
 
 SUBJECTS = ("test_0000", "test_0003", "test_0005")
@@ -47,7 +47,7 @@ Images = dict[str, list[Tensor]]
 def walk(run: str, file: Path, subject: str) -> tuple[Images, list[Scene]]:
     """Return the images of a walking subject by way to draw them, values 0 to 255, and the scenes that they show."""
     description, _ = read_stored(run)
-    data = data_of(description)
+    data = training_data(description, "human_scans")
     height, width = description.target.size
     who, moments = follow_motion(generated_person(data, subject), file, FRAMES, START)
     cameras = orbit(moments, [AZIMUTH] * FRAMES, (height, width))

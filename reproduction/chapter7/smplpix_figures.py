@@ -23,13 +23,13 @@ from benchmarks.rendering.builders import build_renderer
 from benchmarks.rendering.smplpix_flicker import describe_training
 from framework.bodies import poses
 from framework.bodies.shape_space import reduce_shapes
-from framework.configuration.loading import read_stored
+from framework.configuration.loading import read_stored, training_data
 from framework.configuration.schema import build, resolve
 from framework.figures.style import titled_figure
 from framework.geometry.camera import Camera
 from framework.geometry.srgb import srgb_from_linear
 from framework.renderer import Renderer, Scene
-from plugins.data.human_scans.animate import data_of, generated_person
+from plugins.data.human_scans.animate import generated_person
 from plugins.data.human_scans.animation import Generated, Moment, actor, on_white, orbit, photograph
 from plugins.data.human_scans.data import HumanScans
 from plugins.data.human_scans.repose import shape_change, subject
@@ -82,7 +82,7 @@ def main(runs: Sequence[str]) -> None:
         sys.exit(__doc__)
     torch.set_num_threads(1)
     description, _ = read_stored(runs[0])
-    data = data_of(description)
+    data = training_data(description, "human_scans")
     height, width = description.target.size or (256, 192)
     renderers = {"mesh": build_renderer("rasterizer", supersampling=4)}
     for run in runs:

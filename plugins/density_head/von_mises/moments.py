@@ -31,8 +31,8 @@ def trigonometric_moments(
         Moments, (count, *batch), or with weights their sums, (count, *batch[:-1]).
     """
     if weights is None:
-        alone = (part.unsqueeze(-1) for part in (mean, concentration))
-        return trigonometric_moments(*alone, count, torch.ones_like(mean).unsqueeze(-1))
+        mean, concentration = mean.unsqueeze(-1), concentration.unsqueeze(-1)
+        return trigonometric_moments(mean, concentration, count, torch.ones_like(mean))
     shape = mean.shape[:-1]
     rows = [
         part.reshape(-1, part.shape[-1]) for part in torch.broadcast_tensors(mean, concentration, weights)
@@ -43,9 +43,9 @@ def trigonometric_moments(
     highest = _highest_order(float(concentration.nan_to_num(nan=0.0).amax()), count)
     step = max(1, AT_ONCE // (mean.shape[-1] * (highest + 1)))
     first = 0
-    for part in zip(*(row.split(step) for row in rows), strict=True):
-        last = first + len(part[0])
-        _sum_moments(*part, moments[: highest + 1, first:last])
+    for angle, width, weight in zip(*(row.split(step) for row in rows), strict=True):
+        last = first + len(angle)
+        _sum_moments(angle, width, weight, moments[: highest + 1, first:last])
         first = last
     return moments.reshape(count, *shape)
 
