@@ -24,6 +24,7 @@ from framework.distributions.protocol import (
     normals,
     peak_widths,
 )
+from framework.distributions.symmetric import Symmetric
 from framework.errors import UserError
 
 DRAWS = 9999
@@ -67,8 +68,9 @@ class Interval(NamedTuple):
 def central_interval(density: Distribution, mass: float, draws: int = DRAWS) -> Interval:
     """Return the central interval with probability `mass` for each number of a density of real numbers or angles.
 
-    Ends are computed from `normals`, `cdf` or `arc_probability`, or from the Fourier series of an angle's density
-    (`circular_moments`), where one of these is known. Otherwise they are order statistics of `draws` draws.
+    Ends are computed from `Symmetric.half_width`, `normals`, `cdf` or `arc_probability`, or from the Fourier series of
+    an angle's density (`circular_moments`), where one of these is known. Otherwise they are order statistics of `draws`
+    draws.
 
     Args:
         density: a density with event_shape (number,).
@@ -247,9 +249,13 @@ def _interval_of_angle(density: Distribution, mass: float) -> Interval | None:
     flat = Reshaped(density, (density.batch_shape.numel(),))
     if not len(flat.batch_shape) or flat.batch_shape.numel() == 0:
         return None
-    law = _arc_function(flat)
     support = density.support
     assert isinstance(support, Circular)
+    width = density.half_width(mass) if isinstance(density, Symmetric) and support.ranges is None else None
+    if width is not None:
+        first = wrap(density.location.double() - width).squeeze(-1)
+        return _exact_interval(first, first + 2 * width.squeeze(-1))
+    law = _arc_function(flat)
     low, high = support.ranges[0] if support.ranges is not None else (-math.pi, math.pi)
     # a part of the circle has two ends, so the quantiles start at the lower end
     if high - low < 2 * math.pi - 1e-9:

@@ -25,6 +25,13 @@ class Symmetric(Distribution):
         """Value of highest density."""
         return self.location
 
+    def half_width(self, mass: float) -> Tensor | None:
+        """Return half the width of the interval around `location` with probability `mass`; None if it is not known.
+
+        The result is float64, (*batch, number). Default: None. Callers then invert the distribution function.
+        """
+        return None
+
 
 @median.register
 def _(density: Symmetric, samples: int) -> Tensor:

@@ -76,6 +76,11 @@ class VonMises(Symmetric):
         """Return the entropy, nats, (*batch)."""
         return functions.entropy(self.concentration).sum(-1)
 
+    def half_width(self, mass: float) -> Tensor:
+        """Return half the width of the arc around each mean with probability `mass`, radians, float64."""
+        concentration = self.concentration.double()
+        return integrals.half_width(torch.full_like(concentration, mass), concentration)
+
 
 estimate.register(VonMises, exact_estimate)
 
