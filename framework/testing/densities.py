@@ -10,7 +10,15 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.distributions.circular import Circular, angular_distance, wrap
-from framework.distributions.protocol import arc_probability, cdf, marginal, median, quadratic_bound
+from framework.distributions.density import circular_grid
+from framework.distributions.protocol import (
+    arc_probability,
+    cdf,
+    marginal,
+    median,
+    quadratic_bound,
+    trigonometric_moments,
+)
 from framework.errors import UserError
 from framework.testing.adaptive import boxes
 from framework.testing.finding import SEED, Finding, Worst, seed
@@ -37,6 +45,8 @@ DRAWS = 20_000
 """Number of draws that are compared with a density."""
 SCALES = (1e-2, 0.1, 1.0, 10.0, 1e2, 1e3)
 """Standard deviations of the random raw parameters at which densities are checked, in addition to the row's `scale`."""
+GRID = 2880
+"""Number of angles of the grid with which trigonometric moments are compared."""
 CELLS = 24
 """Number of cells of about equal mass in which draws of one number are counted."""
 MEDIAN_DRAWS = 2000
@@ -547,14 +557,24 @@ def moments(density: Distribution, worst: Worst) -> None:
 
 
 def masses(density: Distribution, worst: Worst) -> None:
-    """Compare `cdf` or `arc_probability`, if known, with the quadrature.
+    """Compare `cdf`, or `arc_probability` and `trigonometric_moments`, if known, with the quadrature.
 
-    The values are the mode ± {0, 0.3, 1, 3, 30} widths of the density.
+    The values are the mode ± {0, 0.3, 1, 3, 30} widths of the density. Moments are compared where a grid is exact.
     """
     quadrature = boxes(density)
     offset = torch.tensor([-30, -3, -1, -0.3, 0, 0.3, 1, 3, 30], dtype=torch.float64)[:, None]
     value = quadrature.mapping.mode[:, 0] + offset * quadrature.mapping.scale[:, 0]
     if isinstance(density.support, Circular):
+        known = trigonometric_moments(density, 8)
+        if known is not None:
+            angles, log_density = circular_grid(density, GRID)
+            mass = log_density.double().exp() * (2 * math.pi / GRID)
+            turns = torch.polar(
+                torch.ones(8, GRID).double(), torch.arange(8).double()[:, None] * angles.double()
+            )
+            gap = (known - torch.einsum("np,p...->n...", turns, mass.to(turns.dtype))).abs()
+            exact = (mass.sum(0) - 1).abs() < 1e-9
+            worst.record(gap.where(exact, 0.0), lambda at: f"moment {at[0]}, {worst.row(at[1])}")
         value = value.clamp(quadrature.mapping.mode[:, 0] - 3.1, quadrature.mapping.mode[:, 0] + 3.1)
         actual = arc_probability(
             density, quadrature.border[:1].unsqueeze(-1).expand(len(offset), -1, 1), value.unsqueeze(-1)

@@ -8,6 +8,8 @@ from torch import Tensor
 
 NEGLIGIBLE = 1e-17
 """Moments of an absolute value below this one are taken as 0."""
+AHEAD = 256
+"""Number of orders above the highest moment at which the recurrence starts, in which an error of its start dies out."""
 AT_ONCE = 2**21
 """Largest number of moments of single densities that are kept in memory at once (16 MiB)."""
 
@@ -19,7 +21,8 @@ def trigonometric_moments(
     """Return the moments E exp(i n X) = I_n(κ) / I_0(κ) exp(i n μ), n = 0 … count - 1, of von Mises densities.
 
     The quotients r_n = I_n / I_{n-1} follow from r_n = κ / (2n + κ r_{n+1}), which is stable for falling n (Gautschi
-    1967), from a lower bound of the first one (Amos 1974, eq. 11). Source of the moments: Mardia & Jupp 2000, §3.5.4.
+    1967). The recurrence starts `AHEAD` orders above the highest moment, or where moments are negligible. Source of the
+    moments: Mardia & Jupp 2000, §3.5.4.
 
     Args:
         mean: μ, radians, float64.
@@ -40,26 +43,31 @@ def trigonometric_moments(
     moments = mean.new_zeros(count, len(rows[0]), dtype=torch.complex128)
     if moments.numel() == 0 or mean.shape[-1] == 0:
         return moments.reshape(count, *shape)
-    highest = _highest_order(float(concentration.nan_to_num(nan=0.0).amax()), count)
+    start = _highest_order(float(concentration.nan_to_num(nan=0.0).amax()), count + AHEAD)
+    highest = min(start, count - 1)
     step = max(1, AT_ONCE // (mean.shape[-1] * (highest + 1)))
     first = 0
     for angle, width, weight in zip(*(row.split(step) for row in rows), strict=True):
         last = first + len(angle)
-        _sum_moments(angle, width, weight, moments[: highest + 1, first:last])
+        _sum_moments(angle, width, weight, start, moments[: highest + 1, first:last])
         first = last
     return moments.reshape(count, *shape)
 
 
-def _sum_moments(mean: Tensor, concentration: Tensor, weights: Tensor, into: Tensor) -> None:
-    """Write the weighted sums of the moments over the last dimension into `into`, (order, row)."""
+def _sum_moments(mean: Tensor, concentration: Tensor, weights: Tensor, start: int, into: Tensor) -> None:
+    """Write the weighted sums of the moments over the last dimension into `into`, (order, row).
+
+    The quotient after the order `start` is taken as κ / (n + 1/2 + √(κ² + (n + 1)² - 1/4)), n = `start`, which agrees
+    with the quotient for large κ up to terms of the order 1/κ³ and lies between its bounds (Amos 1974, eq. 9 and 11).
+    """
     highest = len(into) - 1
     quotients = torch.empty(highest, *mean.shape, dtype=torch.float64, device=mean.device)
-    following = concentration / (
-        highest + 0.5 + torch.hypot(concentration, torch.full_like(mean, highest + 1.5))
-    )
-    for order in range(highest, 0, -1):
-        torch.div(concentration, (concentration * following).add_(2 * order), out=quotients[order - 1])
-        following = quotients[order - 1]
+    far = torch.full_like(mean, math.sqrt((start + 1) ** 2 - 0.25))
+    following = concentration / (start + 0.5 + torch.hypot(concentration, far))
+    for order in range(start, 0, -1):
+        following = concentration / (concentration * following).add_(2 * order)
+        if order <= highest:
+            quotients[order - 1] = following
     power = torch.complex(weights, torch.zeros_like(weights))
     turn = torch.polar(torch.ones_like(mean), mean)
     into[0] = power.sum(-1)
