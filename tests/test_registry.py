@@ -7,7 +7,7 @@ import subprocess
 import sys
 from importlib.metadata import EntryPoint, PathDistribution
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -42,9 +42,8 @@ def fake(monkeypatch: pytest.MonkeyPatch):
     entries: list[EntryPoint] = []
     installed.cache_clear()
     unusable_names.cache_clear()
-    monkeypatch.setattr(
-        registry, "entry_points", lambda group: [item for item in entries if item.group == group]
-    )
+    select = lambda group: [item for item in entries if item.group == group]  # noqa: E731
+    monkeypatch.setattr(registry, "_entry_points", lambda: SimpleNamespace(select=select))
     yield entries
     installed.cache_clear()
     unusable_names.cache_clear()

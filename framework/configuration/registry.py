@@ -3,6 +3,7 @@
 import re
 from contextlib import suppress
 from functools import cache
+from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
@@ -40,7 +41,7 @@ def unusable_names(group: str) -> dict[str, str]:
                 f"Several installed packages define a {group} {name!r}: {objects}. Uninstall all but one of these "
                 "packages, or rename their entry points."
             )
-        elif entries[0].dist and not entries[0].dist.name:  # a package that was only partly removed
+        elif entries[0].dist and not package_name(entries[0].dist):  # a package that was only partly removed
             reasons[name] = (
                 f"The {group} {name!r} ({entries[0].value}) belongs to a package whose METADATA file is missing. "
                 "Install that package again, or remove its remaining files."
@@ -48,10 +49,22 @@ def unusable_names(group: str) -> dict[str, str]:
     return reasons
 
 
+@cache
+def package_name(package: Any) -> str | None:
+    """Return the name of an installed package (an `Entry.dist`), which Python parses again for each access."""
+    return package.name
+
+
+@cache
+def _entry_points() -> Any:
+    """Return the entry points of all installed packages, which takes as long as those of one group."""
+    return entry_points()
+
+
 def _entries(group: str) -> dict[str, list[Entry]]:
     """Return the entry points of a group by name, sorted; if two have the same name and object, one of them."""
     entries_by_name: dict[str, list[Entry]] = {}
-    for entry in sorted(entry_points(group=f"framework.{group}"), key=lambda entry: entry.name):
+    for entry in sorted(_entry_points().select(group=f"framework.{group}"), key=lambda entry: entry.name):
         same_name = entries_by_name.setdefault(entry.name, [])
         if entry.value not in [other.value for other in same_name]:
             same_name.append(entry)
@@ -89,6 +102,8 @@ def load(group: str, name: str) -> type[Any]:
             base.
     """
     entry = find(group, name)
+    # the contract is imported before its plugin, because framework.metric imports torchmetrics in its own way
+    import_module(f"framework.{group}")
     try:
         cls = entry.load()
     except ModuleNotFoundError as error:
@@ -158,7 +173,7 @@ def config_folders() -> dict[str, Path]:
         ConfigError: A plugin ships a config of Hydra itself.
     """
     folders: dict[str, Path] = {}
-    for entry in sorted(entry_points(group="framework.conf"), key=lambda entry: entry.name):
+    for entry in sorted(_entry_points().select(group="framework.conf"), key=lambda entry: entry.name):
         package, *rest = entry.value.split(".")
         roots = package_folders(package)
         if not roots:

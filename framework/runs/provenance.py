@@ -4,7 +4,7 @@ import platform
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 
-from framework.configuration.registry import GROUPS, installed
+from framework.configuration.registry import GROUPS, installed, package_name
 
 _PACKAGES = ("torch", "pytorch-lightning", "hydra-core", "omegaconf", "numpy", "mlflow")
 
@@ -16,9 +16,9 @@ def package_versions() -> dict[str, str]:
     """
     names = set(_PACKAGES)
     for group in GROUPS:
-        names |= {entry.dist.name for entry in installed(group).values() if entry.dist and entry.dist.name}
+        names |= {package_name(entry.dist) or "" for entry in installed(group).values() if entry.dist}
     versions = {"python": platform.python_version()}
-    for name in sorted(names):
+    for name in sorted(names - {""}):
         try:
             versions[name] = version(name)
         except PackageNotFoundError:
