@@ -4,11 +4,11 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torch
-import torchmetrics
 from jaxtyping import Float
 from torch import Tensor
 
 from framework.prediction import Prediction, Split
+from framework.storage.light_torchmetrics import torchmetrics
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

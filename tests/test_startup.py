@@ -1,25 +1,113 @@
 """A command does not import modules that it does not need, as fresh processes show."""
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from tests.conftest import listed
+from framework.configuration.modes import MODES
+from tests.conftest import Once, listed
 
 HEAVY = {
     "torch",
+    "torch._dynamo",
+    "torchmetrics",
     "pytorch_lightning",
+    "lightning_fabric",
     "mlflow",
     "numba",
-    "scipy",
+    "scipy.linalg",  # every part of SciPy that is slow to import needs it
+    "sympy",
+    "pandas",
     "matplotlib",
     "trimesh",
     "sklearn",
     "kornia",
 }
+MODEL = (
+    *("data=dial", "density_head=scvae", "density_head.hidden=4", "density_head.samples=8", "encoder=[mlp]"),
+    *(
+        "encoder.mlp.widths=[4]",
+        "metric=[log_likelihood]",
+        "batch_size=64",
+        "trainer.max_epochs=1",
+        "samples=9",
+        "pictures=false",
+    ),
+)
+COMMANDS: dict[str, tuple[str, str]] = {
+    "train": (" ".join(MODEL), "torchmetrics pytorch_lightning lightning_fabric torch._dynamo sympy"),
+    "test": ("checkpoint=train pictures=false", "torchmetrics"),
+    "calibrate": ("checkpoint=train uncertainty=[conformal] pictures=false", "torchmetrics"),
+    "combine": ("mode.members=[train,train] pictures=false", "torchmetrics"),
+    "predict": ("checkpoint=train mode.interval=0.9", ""),
+    "encode": (
+        "data=point_cloud_folder encoder=[occupancy] mode.files=clouds mode.into=features",
+        "numba scipy.linalg",
+    ),
+    "work_precision": ("checkpoint=train mode.values=[1,2] mode.repeats=2", "torchmetrics matplotlib"),
+    "check": ("metric=[accuracy]", "torchmetrics"),
+    "plugins": ("", ""),
+    "sync": ("mode.run=train", ""),
+}
+"""Settings of a command for each mode, and the slow packages that this command needs besides torch."""
+STARTS = """
+import json, os, sys
+from multiprocessing import get_context
+import hydra, torch
+
+def run(mode, arguments):
+    os.dup2(os.open(f"{mode}.txt", os.O_WRONLY | os.O_CREAT), 1)
+    os.dup2(1, 2)
+    sys.argv[1:] = arguments
+    code = 0
+    try:
+        main()
+    except SystemExit as end:
+        code = end.code
+    with open(f"{mode}.json", "w") as file:
+        json.dump({"code": code, "modules": [*sys.modules]}, file)
+
+sys.argv[0] = "framework"
+from framework.app import main
+for line in sys.stdin:
+    fork = get_context("fork").Process(target=run, args=json.loads(line))
+    fork.start()
+    fork.join()
+"""
+"""Script that runs each command in a fork of a process that has imported torch and Hydra only."""
+
+
+@pytest.fixture(scope="module")
+def started(once: Once, stranger_site: Path) -> Path:
+    """Return a folder with the output, the exit code and the imported modules of a command of each mode."""
+
+    def run(folder: Path) -> None:
+        (folder / "clouds").mkdir()
+        np.save(folder / "clouds" / "a.npy", np.random.default_rng(0).random((50, 3), np.float32))
+        own = {mode: ["logger=none", "threads=1", f"hydra.run.dir={mode}"] for mode in COMMANDS}
+        lines = [
+            json.dumps([mode, [f"mode={mode}", *settings.split(), *own[mode]]])
+            for mode, (settings, _) in COMMANDS.items()
+        ]
+        environment = {**os.environ, "PYTHONPATH": str(stranger_site)}
+        subprocess.run([sys.executable, "-c", STARTS], cwd=folder, env=environment, check=True, text=True,
+                       input="\n".join(lines) + "\n", timeout=900)  # fmt: skip
+
+    return once("started", run)
+
+
+@pytest.mark.parametrize("mode", sorted(MODES.keys() - {"export"}))  # export uses nearly all of torch
+def test_a_mode_imports_only_what_it_uses(mode: str, started: Path) -> None:
+    done = json.loads((started / f"{mode}.json").read_text())
+    # a run without a store cannot be sent
+    assert done["code"] == (1 if mode == "sync" else 0), (started / f"{mode}.txt").read_text()
+    used = {"torch", *COMMANDS[mode][1].split()}
+    assert not HEAVY & set(done["modules"]) - used
 
 
 @pytest.mark.parametrize(
@@ -32,7 +120,7 @@ def test_asking_imports_nothing_heavy_and_no_plugin(arguments: tuple[str, ...], 
     assert done.code == 0, done.out
     modules = done.modules
     assert "framework.app" in modules
-    assert not HEAVY & {name.partition(".")[0] for name in modules}
+    assert not HEAVY & modules
     assert not [name for name in modules if name.startswith("plugins.")]
     assert list(tmp_path.iterdir()) == [], "asking leaves nothing behind"
 

@@ -44,7 +44,7 @@ INDEX = re.compile(
 )
 """Names that pandas, R and databases give to a column that numbers the rows."""
 
-CELLS_AT_ONCE = 2**16
+CELLS_AT_ONCE = 2**9
 """Number of cells that are sorted into columns at once, which is several times as fast as one by one."""
 MOST_LOOKED_AT = 2000
 """Largest number of cells, evenly spaced in a column of words, that are checked for numbers in another notation."""

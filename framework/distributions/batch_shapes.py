@@ -9,6 +9,7 @@ from torch.distributions import Distribution, constraints
 
 from framework.distributions import protocol
 from framework.distributions.description import one_line
+from framework.distributions.shapes import broadcast_shapes, unravel_index
 
 
 class Stacked(Distribution):
@@ -126,7 +127,7 @@ class Reshaped(Distribution):
         Args:
             value: values (*sample, *batch, *event) in the new batch_shape.
         """
-        whole = torch.broadcast_shapes(value.shape, torch.Size((*self.batch_shape, *self.event_shape)))
+        whole = broadcast_shapes(value.shape, torch.Size((*self.batch_shape, *self.event_shape)))
         lead = whole[: len(whole) - len(self.batch_shape) - len(self.event_shape)]
         flat = value.expand(whole).reshape(*lead, *self.density.batch_shape, *self.event_shape)
         return flat, torch.Size((*lead, *self.batch_shape))
@@ -357,7 +358,7 @@ def _(density: Reshaped, index: tuple[Tensor, ...], origin: Tensor) -> Distribut
     for part, size in zip(index, density.batch_shape, strict=True):
         item = item * size + part
     inner = density.density
-    return protocol.recentre(inner, torch.unravel_index(item, inner.batch_shape), origin)
+    return protocol.recentre(inner, unravel_index(item, inner.batch_shape), origin)
 
 
 def _stack(parts: list[Tensor | None], axis: int = -1) -> Tensor | None:

@@ -12,6 +12,7 @@ from torch.distributions import Categorical, Distribution, Independent, Multivar
 
 from framework.distributions import protocol
 from framework.distributions.description import CategoricalDensity
+from framework.distributions.shapes import broadcast_shapes
 
 for _kind in (
     *(torchs.ExponentialFamily, torchs.Categorical, torchs.OneHotCategorical, torchs.MultivariateNormal),
@@ -151,7 +152,7 @@ def _(density: Independent, value: Tensor) -> protocol.QuadraticBound | None:
     base = density.base_dist
     if not isinstance(base, Normal) or density.reinterpreted_batch_ndims != 1:
         return None
-    stiffness = base.scale.square().reciprocal().expand(torch.broadcast_shapes(value.shape, base.scale.shape))
+    stiffness = base.scale.square().reciprocal().expand(broadcast_shapes(value.shape, base.scale.shape))
     return protocol.QuadraticBound(density.log_prob(value), (base.loc - value) * stiffness, stiffness)
 
 

@@ -30,6 +30,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.distributions.circular import Circular, circular_median
+from framework.distributions.shapes import broadcast_shapes
 from framework.errors import UserError
 
 
@@ -139,7 +140,7 @@ class _Recentred(Distribution):
         self.density = density
         self.origin = origin
         self.like = density.sample(torch.Size((0,)))
-        shape = torch.broadcast_shapes(origin.shape[:-1], *(part.shape for part in index))
+        shape = broadcast_shapes(origin.shape[:-1], *(part.shape for part in index))
         flat = torch.zeros(shape, dtype=torch.int64, device=origin.device)
         for part, size in zip(index, density.batch_shape, strict=True):
             flat = flat * size + part

@@ -12,6 +12,7 @@ from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.distributions.circular import Circular, circular
 from framework.distributions.density import Mixture
 from framework.distributions.description import one_line
+from framework.distributions.shapes import broadcast_shapes
 from framework.errors import UserError
 
 
@@ -67,7 +68,7 @@ class UniformAngles(Distribution):
         return self.like.new_zeros(self.batch_shape + self.event_shape)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        return -self.entropy().expand(torch.broadcast_shapes(value.shape[:-1], self.batch_shape))
+        return -self.entropy().expand(broadcast_shapes(value.shape[:-1], self.batch_shape))
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         shape = torch.Size(sample_shape) + self.batch_shape + self.event_shape
@@ -107,7 +108,7 @@ def _(density: UniformAngles, index: Tensor) -> UniformAngles:
 
 @protocol.recentre.register
 def _(density: UniformAngles, index: tuple[Tensor, ...], origin: Tensor) -> UniformAngles:
-    shape = torch.broadcast_shapes(origin.shape[:-1], *(part.shape for part in index))
+    shape = broadcast_shapes(origin.shape[:-1], *(part.shape for part in index))
     return UniformAngles(origin, shape, density.event_shape)
 
 

@@ -4,6 +4,7 @@ import ctypes
 import math
 import platform
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -73,28 +74,39 @@ def measure(
             f"Got inputs of shape {tuple(inputs.shape)}, but a batch of at least one sample is required to measure "
             "the cost. Give a batch of the data."
         )
-    from torch.utils.flop_counter import FlopCounterMode  # slow to import; only measurements need it
-
     device = inputs.device
     size = len(inputs)
     with torch.random.fork_rng([device] if device.type == "cuda" else []):
         half = budget_seconds / 2
         batch_seconds = wall_time(lambda: predict(inputs), device, repeats=repeats, budget_seconds=half)
         single_seconds = wall_time(lambda: predict(inputs[:1]), device, repeats=repeats, budget_seconds=half)
-        counter = FlopCounterMode(display=False)
-        with counter:
-            predict(inputs)
+        flops = None if parameters is None else count_flops(lambda: predict(inputs))
         memory = peak_memory(lambda: predict(inputs), device)
     return Cost(
         milliseconds_per_sample=1e3 * batch_seconds / size,
         latency_milliseconds=1e3 * single_seconds,
-        flops_per_sample=None if parameters is None else round(counter.get_total_flops() / size),
+        flops_per_sample=None if flops is None else round(flops / size),
         parameters=parameters,
         peak_memory_mib=memory / 2**20,
         batch_size=size,
         device=device_name(device),
         threads=torch.get_num_threads(),
     )
+
+
+def count_flops(call: Callable[[], object]) -> int:
+    """Return the number of floating-point operations of `call`, as torch counts them (see `Cost`)."""
+    from torch.utils import flop_counter  # only measurements need it
+
+    # torch excludes the counter from compilation, and imports its compiler for that, which takes a second. If nothing
+    # has been compiled yet, the counter is marked as excluded already.
+    counting = getattr(flop_counter._FlopCounterMode.__torch_dispatch__, "__wrapped__", None)
+    if counting is not None and "torch._dynamo" not in sys.modules:
+        vars(counting).setdefault("__dynamo_disable", counting)
+    counter = flop_counter.FlopCounterMode(display=False)
+    with counter:
+        call()
+    return counter.get_total_flops()
 
 
 def wall_time(

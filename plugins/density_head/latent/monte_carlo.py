@@ -17,6 +17,7 @@ from torch.distributions import Distribution
 from framework.distributions.closed_forms import normal_quantile
 from framework.distributions.density import Mixture, concatenate_estimates
 from framework.distributions.protocol import Estimate, estimate, marginal, tempered_density
+from framework.distributions.shapes import broadcast_shapes
 from framework.distributions.tempering import tempered_classes
 from framework.errors import ConfigError
 
@@ -259,7 +260,7 @@ def rows_of(
         (*sample, *batch) of the result.
     """
     lead = value.shape[: value.dim() - len(event_shape)]
-    shape = torch.Size(torch.broadcast_shapes(lead, batch_shape))
+    shape = broadcast_shapes(lead, batch_shape)
     items = torch.arange(batch_shape.numel(), device=value.device).reshape(batch_shape).expand(shape)
     return value.expand(shape + event_shape).reshape(-1, *event_shape), items.reshape(-1), shape
 

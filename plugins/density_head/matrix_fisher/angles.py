@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from framework.distributions.shapes import broadcast_shapes
 from plugins.density_head.matrix_fisher import quadrature, quaternions
 from plugins.density_head.matrix_fisher.functions import Frame, log_height
 
@@ -37,7 +38,7 @@ def log_marginal(angle: Float[Tensor, "..."], frame: Frame, index: int) -> Float
 
         p(a) = ∫ cos e / (4π k(λ)) exp(-μ) I₀ₑ((ν-μ)/2) de.
     """
-    shape = torch.broadcast_shapes(angle.shape, frame.falls.shape[:-1])
+    shape = broadcast_shapes(angle.shape, frame.falls.shape[:-1])
     parts = (quaternions.of_matrix(frame.left), quaternions.of_matrix(frame.right), frame.falls)
     parts = [part.expand(*shape, part.shape[-1]).reshape(-1, part.shape[-1]) for part in parts]
     angles = angle.double().expand(shape).reshape(-1)

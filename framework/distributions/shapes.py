@@ -1,0 +1,25 @@
+"""Functions of shapes and indices that torch has too, but whose first call in torch imports SymPy for half a second."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
+    """Return the shape to which tensors of these shapes are broadcast.
+
+    Raises:
+        ValueError: The shapes do not fit each other.
+    """
+    return torch.Size(np.broadcast_shapes(*map(tuple, shapes)))
+
+
+def unravel_index(index: Tensor, shape: Sequence[int]) -> tuple[Tensor, ...]:
+    """Return the index of each dimension of a tensor of this shape, for indices into the flattened tensor."""
+    parts: list[Tensor] = []
+    for size in reversed(shape):
+        parts.append(index % size)
+        index = index // size
+    return tuple(reversed(parts))

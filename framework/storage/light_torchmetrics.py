@@ -1,0 +1,49 @@
+"""torchmetrics, imported without Matplotlib and SciPy's signal processing.
+
+The import of torchmetrics loads both, which takes three times as long as its own modules, and the framework uses
+neither: Matplotlib serves torchmetrics' method `plot`, and SciPy's module gets an old name for a metric of speech. Here
+`plot` imports Matplotlib when it is called.
+"""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+PLOTS, SIGNAL = "torchmetrics.utilities.plot", "scipy.signal"
+
+
+class _Plots(ModuleType):
+    """Stand-in for torchmetrics' module of plots, whose functions import the module when they are called."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # a type, which only annotations use
+            return Any
+
+        def plot(*arguments: Any, **options: Any) -> Any:
+            return getattr(import_module(PLOTS), name)(*arguments, **options)
+
+        return plot
+
+
+class _Signal(ModuleType):
+    """Stand-in for SciPy's module, which has the name that torchmetrics would add."""
+
+    hamming = None
+
+
+@contextmanager
+def _standing_in(*modules: ModuleType) -> Iterator[None]:
+    """Let import statements in the block find these modules, unless the modules of the same names are loaded."""
+    added = [module for module in modules if sys.modules.setdefault(module.__name__, module) is module]
+    try:
+        yield
+    finally:
+        for module in added:
+            del sys.modules[module.__name__]
+
+
+with _standing_in(*([] if "torchmetrics" in sys.modules else [_Plots(PLOTS), _Signal(SIGNAL)])):
+    import torchmetrics as torchmetrics
