@@ -29,16 +29,16 @@ def gradient(subject: HeadSubject, worst: Worst) -> None:
     head = subject.make().double().train()
     for size in (0.1, 1.0, 3.0, 30.0, 1e3):
         # not the features to which trees were fitted, since trees jump there
-        raw = (1.013 * size * subject.raw_parameters(8).double()).requires_grad_()
+        raw = (1.013 * size * subject.raw_parameters(8).double()).flatten(1).requires_grad_()
         value = as_type(subject.values(8), torch.float64)
         with torch.no_grad():
             # at large raw parameters, a draw of several reals may be rounded by more than the width of the density
             if subject.row.target.kind != "real" or size <= 30:
-                value[4:] = seeded(head, raw[4:]).sample()
+                value[4:] = seeded(head, raw[4:].view(4, *subject.raw_shape)).sample()
 
         def loss(raw: Tensor = raw, value: Tensor = value) -> Tensor:
             seed(SEED)
-            return head.loss(raw, value)
+            return head.loss(raw.view(8, *subject.raw_shape), value)
 
         arguments = {"raw parameters": raw}
         if size <= 3:

@@ -285,7 +285,7 @@ def _mixture_of_one(subject: HeadSubject, worst: Worst) -> None:
         results = {}
         for number in (1, 2):
             seed(SEED)
-            density = head(raw) if number == 1 else Mixture(torch.zeros(4, 1), head(raw.unsqueeze(-2)))
+            density = head(raw) if number == 1 else Mixture(torch.zeros(4, 1), head(raw.unsqueeze(1)))
             results[number] = {"log_prob": density.log_prob(value), "mode": density.mode}
             seed(SEED)
             results[number]["entropy"] = density.entropy()
