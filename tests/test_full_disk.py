@@ -43,11 +43,14 @@ def test_a_disk_that_is_full_from_the_start(stranger_site: Path, tmp_path: Path)
 
 @pytest.mark.slow
 def test_a_full_store_stops_nobody(framework: Framework, stranger_site: Path, tmp_path: Path) -> None:
-    """The run waits 5 s for the store when it closes, not a minute."""
-    impatient = "from framework.tracking.tracker import MlflowTracker as tracker\n"
-    impatient += "tracker.__init__.__kwdefaults__['patience'] = 5.0\n"
-    arguments = (*TINY, "+data.longest_file=100000", *STEPS, f"hydra.run.dir={tmp_path / 'run'}")
-    done = listed(*arguments, folder=tmp_path, site=stranger_site, before=impatient)
+    """No process can write a longer file; the run waits 5 s for the store when it closes, not a minute."""
+    before = (
+        "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (100_000, resource.RLIM_INFINITY))\n"
+        "from framework.tracking.tracker import MlflowTracker as tracker\n"
+        "tracker.__init__.__kwdefaults__['patience'] = 5.0\n"
+    )
+    arguments = (*TINY, *STEPS, f"hydra.run.dir={tmp_path / 'run'}")
+    done = listed(*arguments, folder=tmp_path, site=stranger_site, before=before)
     assert done.code == 0, done.out
     assert "mode=sync" in done.out
     assert "Traceback" not in done.out
