@@ -36,6 +36,7 @@ DENSITIES: dict[str, tuple[Target, dict[str, Any], float]] = {
     "narrow von Mises": (ANGLE, {"name": "von_mises"}, 100.0),
     "mixture of 5 von Mises": (ANGLE, {"name": "mixture"}, 1.0),
     "mixture of 500 von Mises": (ANGLE, {"name": "mixture", "components": 500}, 1.0),
+    "SCVAE of 500 von Mises": (ANGLE, {"name": "scvae"}, 1.0),
     "von Mises of 3 angles": (THREE, {"name": "von_mises"}, 1.0),
     "matrix Fisher of 3 angles": (THREE, {"name": "matrix_fisher"}, 1.0),
 }
