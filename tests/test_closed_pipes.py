@@ -25,6 +25,11 @@ OF_OUR_OWN = {
 """Processes that communicate with the framework by pipes, and that must end when their pipe is closed."""
 
 
+EXPORTED = {
+    "framework/deployment/exported_folder/predict.py",
+    "framework/deployment/exported_folder/serve.py",
+}
+"""Scripts of an exported folder, which are copied there and run without the framework (test_export.py)."""
 GENERATORS = {"plugins/density_head/von_mises/fit_coefficients.py"}
 """Programs that write one file of the source and print nothing."""
 
@@ -38,7 +43,7 @@ def programs() -> set[str]:
     return {str(file.relative_to(ROOT)) for file in run}
 
 
-PROGRAMS = sorted(programs() - OF_OUR_OWN - GENERATORS)
+PROGRAMS = sorted(programs() - OF_OUR_OWN - GENERATORS - EXPORTED)
 
 
 @contextmanager

@@ -109,6 +109,7 @@ COMMANDS: dict[str, Sequence[str]] = {
     "combine": ("mode.members=[{train},{train}]",),
     "predict": ("checkpoint={train}",),
     "encode": ("data=point_cloud_folder", "encoder=[bps]", "mode.files={clouds}", "mode.into={features}"),
+    "export": ("checkpoint={train}",),
     "work_precision": ("checkpoint={combine}", "mode.metrics=[nll]", "mode.repeats=2"),
     "check": ("data=moons",),
     "plugins": (),

@@ -43,7 +43,7 @@ MODES: Mapping[str, Mode] = {
     "combine": Mode((*_STORED, "outliers", "uncertainty"), ("data", "outliers", "metric", *MODEL)),
     "predict": Mode((*_RUN, *BUNDLES, "workers", "samples", "checkpoint", "data"), ("data", *MODEL)),
     "encode": Mode((*_RUN, *BUNDLES, "batch_size", "workers", "data", "encoder")),
-    "export": Mode((*BUNDLES, "checkpoint", "data"), ("data", *MODEL)),
+    "export": Mode((*BUNDLES, "checkpoint"), ("data", *MODEL)),
     "work_precision": Mode((*_STORED, "checkpoint"), ("data", "metric", *MODEL)),
     "check": Mode((*BUNDLES, *GROUPS)),
     "plugins": Mode(),

@@ -402,10 +402,10 @@ def _reads_all_parameters(subject: HeadSubject, worst: Worst) -> None:
             seed(SEED)
             before = head.loss(raw, value)
             for column in sorted(unread)[:MOST_COLUMNS]:
-                other = raw.clone()
-                other[:, column] = 0.4 - 0.9 * raw[:, column]
+                other = raw.flatten(1).clone()
+                other[:, column] = 0.4 - 0.9 * other[:, column]
                 seed(SEED)
-                if not torch.equal(head.loss(other, value), before):
+                if not torch.equal(head.loss(other.view_as(raw), value), before):
                     unread.remove(column)
             if len(unread) > max(0, head.size - MOST_COLUMNS):
                 continue

@@ -16,6 +16,7 @@ import csv
 import importlib
 import json
 import math
+import os
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -189,5 +190,14 @@ def main(arguments: Mapping[str, Any] | None = None) -> None:
         writer.writerows(rows)
 
 
+def command() -> None:
+    """Run `main` as a command, which may be piped into a reader that ends early, such as `head`."""
+    try:
+        main()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 if __name__ == "__main__":
-    main()
+    command()

@@ -17,7 +17,7 @@ import numpy as np
 import uvicorn
 from fastapi import FastAPI, HTTPException, Request, Response
 
-from framework.deployment.exported_folder.predict import load
+from framework.deployment.exported_folder.predict import Model, load
 
 MOST_BYTES = 64 * 2**20
 """Largest size of a request."""
@@ -26,44 +26,50 @@ MOST_ROWS = 10_000
 DEEPEST = 8
 """Largest depth of nested brackets in JSON."""
 
-model = load()
-app = FastAPI(title="exported model", docs_url=None, redoc_url=None, openapi_url=None)
+
+def service(model: Model) -> FastAPI:
+    """Return the web service of a model."""
+    app = FastAPI(title="exported model", docs_url=None, redoc_url=None, openapi_url=None)
+
+    @app.get("/ping")
+    def ping() -> str:
+        """Return a word, so that a load balancer knows that the service is up."""
+        return "ok"
+
+    @app.get("/model")
+    def describe() -> dict[str, Any]:
+        """Return the description of the model: inputs, target, family of the densities, calibration."""
+        return model.description
+
+    @app.post("/predict")
+    async def predict(request: Request) -> Response:
+        """Return a row of predictions for each input of a request."""
+        content = await _read(request)
+        try:
+            rows = _rows(model, request, content)
+        except (ValueError, TypeError, EOFError, OverflowError) as error:
+            raise HTTPException(400, str(error)[:500]) from None
+        return Response(json.dumps({"predictions": rows}), media_type="application/json")
+
+    return app
 
 
-@app.get("/ping")
-def ping() -> str:
-    """Return a word, so that a load balancer knows that the service is up."""
-    return "ok"
-
-
-@app.get("/model")
-def describe() -> dict[str, Any]:
-    """Return the description of the model: inputs, target, family of the densities, calibration."""
-    return model.description
-
-
-@app.post("/predict")
-async def predict(request: Request) -> Response:
-    """Return a row of predictions for each input of a request."""
-    content = await _read(request)
-    try:
-        if request.headers.get("content-type", "").startswith("application/octet-stream"):
-            inputs, interval = (
-                np.load(io.BytesIO(content), allow_pickle=False),
-                request.query_params.get("interval"),
-            )
-        else:
-            inputs, interval = _read_json(content)
-        level = None if interval is None else float(interval)
-        if level is not None and not 0 < level < 1:
-            raise ValueError("interval must be between 0 and 1.")
-        inputs = np.asarray(inputs)
-        if inputs.ndim and len(inputs) > MOST_ROWS:
-            raise ValueError(f"Got {len(inputs)} inputs, but at most {MOST_ROWS} are allowed in a request.")
-        rows = list(model.table(inputs, level))
-    except (ValueError, TypeError, EOFError, OverflowError) as error:
-        raise HTTPException(400, str(error)[:500]) from None
-    return Response(json.dumps({"predictions": rows}), media_type="application/json")
+def _rows(model: Model, request: Request, content: bytes) -> list[dict[str, Any]]:
+    """Return the predictions for the body of a request."""
+    if request.headers.get("content-type", "").startswith("application/octet-stream"):
+        inputs, interval = (
+            np.load(io.BytesIO(content), allow_pickle=False),
+            request.query_params.get("interval"),
+        )
+    else:
+        inputs, interval = _read_json(content)
+    level = None if interval is None else float(interval)
+    if level is not None and not 0 < level < 1:
+        raise ValueError("interval must be between 0 and 1.")
+    inputs = np.asarray(inputs)
+    if inputs.ndim and len(inputs) > MOST_ROWS:
+        raise ValueError(f"Got {len(inputs)} inputs, but at most {MOST_ROWS} are allowed in a request.")
+    return list(model.table(inputs, level))
 
 
 async def _read(request: Request) -> bytes:
@@ -99,9 +105,10 @@ def main() -> None:
     )
     parser.add_argument("--port", type=int, default=8000)
     options = parser.parse_args()
+    model = load()
     shape = [1 if isinstance(size, str) else size for size in model.description["input"]["shape"]]
     model(np.zeros(shape))  # the first request is as fast as the others
-    uvicorn.run(app, host=options.host, port=options.port, log_level="warning")
+    uvicorn.run(service(model), host=options.host, port=options.port, log_level="warning")
 
 
 if __name__ == "__main__":
