@@ -26,6 +26,8 @@ BAD = {
     "package of its name": ("a/b.yaml", HEADED.format("_name_", "a: 1")),
     "package in a choice": ("x.yaml", "defaults: [{/a@hydra.callbacks: b}]"),
     "choice of logging": ("x.yaml", "defaults: [{override /hydra/job_logging: x}]"),
+    "launcher of other machines": ("x.yaml", "defaults: [{override /hydra/launcher: ray}]"),
+    "launcher's address": ("x.yaml", "hydra: {launcher: {address: 10.0.0.1}}"),
     "choice elsewhere": ("x.yaml", "defaults: [{override /hydra/launcher: ../../x}]"),
     "choice as text": ("x.yaml", "defaults: [/a@hydra.job/b]"),
     "store": ("x.yaml", "logger: {uri: 'http://127.0.0.2'}"),

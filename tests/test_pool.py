@@ -16,6 +16,7 @@ import pytest
 
 from framework.errors import ConfigError
 from framework.runs.job import write_value
+from framework.sweeps import engines
 from framework.sweeps import jobs as sweep
 from tests.conftest import imported_by, wait_for
 
@@ -57,9 +58,9 @@ sys.modules["framework.sweeps.rehearsal"] = types.SimpleNamespace(refuse_mistake
 
 if "IMPORTS" in os.environ:
     import functools
-    from framework.sweeps import processes
+    from framework.sweeps import engines
     imports = os.environ["IMPORTS"].split(",")
-    processes.Forks = functools.partial(lambda kind, modules: kind(imports), processes.Forks)
+    engines.Forks = functools.partial(lambda kind, modules: kind(imports), engines.Forks)
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 def run(config):
@@ -155,9 +156,10 @@ hydra:
 class App:
     """Small application in a folder of its own, with the folder of its sweep."""
 
-    def __init__(self, folder: Path, fork: bool = False) -> None:
+    def __init__(self, folder: Path, fork: bool = False, launcher: str = "pool") -> None:
         self.folder = folder
-        self.fork = fork
+        self.launcher = [f"hydra.launcher.fork={str(fork).lower()}"] if launcher == "pool" else []
+        self.chosen = f"hydra/launcher={launcher}"
         self.sweep = folder / "sweep"
         self.output = folder / "output.txt"
         self.processes: list[subprocess.Popen[bytes]] = []
@@ -179,7 +181,7 @@ class App:
     def start(self, *arguments: str) -> subprocess.Popen[bytes]:
         with self.output.open("wb") as output:
             process = subprocess.Popen(
-                [sys.executable, "app.py", *arguments, f"hydra.launcher.fork={str(self.fork).lower()}"],
+                [sys.executable, "app.py", *arguments, *self.launcher],
                 cwd=self.folder,
                 env=self.environment,
                 stdout=output,
@@ -189,8 +191,8 @@ class App:
         return process
 
     def __call__(self, *arguments: str) -> tuple[int, str]:
-        """Run a sweep with the launcher `pool`, and return its exit code and output."""
-        return self.start("-m", "hydra/launcher=pool", *arguments).wait(timeout=60), self.said()
+        """Run a sweep, and return its exit code and output."""
+        return self.start("-m", self.chosen, *arguments).wait(timeout=60), self.said()
 
     def said(self) -> str:
         return self.output.read_text(encoding="utf-8")
@@ -316,7 +318,7 @@ def test_as_many_at_once_as_asked_for(app: App) -> None:
 
 
 def test_what_a_job_is_told(app: App, monkeypatch: pytest.MonkeyPatch) -> None:
-    cores = sweep.cores()
+    cores = engines.cores()
     assert app("what=environment", "x=0,1,2", "hydra.launcher.jobs=1", "hydra.launcher.devices=[4,5]")[0] == 0
     told = [json.loads((app.sweep / str(number) / "environment.json").read_text()) for number in range(3)]
     assert {one["OMP_NUM_THREADS"] for one in told} == {str(cores)}

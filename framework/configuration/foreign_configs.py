@@ -16,6 +16,8 @@ OWN = ("hydra", "logger", "mode")
 """Parts of a config that only the user may set: they determine the command, the output folder and the store."""
 HARMLESS = {"hydra": ("sweeper", "launcher", "verbose"), "logger": ("name", "experiment"), "mode": ()}
 """Keys in the parts `OWN` that an added config folder may set nevertheless."""
+LAUNCHERS, LAUNCHER_KEYS = ("basic", "pool"), ("jobs", "retries", "devices", "fork")
+"""Launchers that an added config folder may choose, and their keys that it may set; others reach other machines."""
 CHOSEN = re.compile(r"hydra/(launcher|sweeper)|logger")
 MOST = 1000
 """Largest number of config files in an added config folder."""
@@ -75,6 +77,9 @@ def _require_harmless(file: Path, folder: Path, groups: Collection[str]) -> None
         value = content.get(key)
         if value is not None and not (isinstance(value, dict) and set(value) <= set(harmless)):
             raise _refusal(file, f"sets {key}: {quote(value)}")
+        launcher = value.get("launcher") if isinstance(value, dict) else None
+        if launcher is not None and not (isinstance(launcher, dict) and set(launcher) <= set(LAUNCHER_KEYS)):
+            raise _refusal(file, f"sets {key}.launcher: {quote(launcher)}")
     try:
         forbid_targets(content)
     except ConfigError as error:
@@ -84,7 +89,8 @@ def _require_harmless(file: Path, folder: Path, groups: Collection[str]) -> None
         for text, name in entry.items() if isinstance(entry, dict) else [(str(entry), "")]:
             group, _, package = str(text).removeprefix("override ").partition("@")
             absolute = group.startswith("/") or not _group(file, folder)
-            if _is_own(group.lstrip("/"), package) or ".." in f"{group}{name}":
+            elsewhere = group.lstrip("/") == "hydra/launcher" and name not in LAUNCHERS
+            if elsewhere or _is_own(group.lstrip("/"), package) or ".." in f"{group}{name}":
                 raise _refusal(file, f"chooses {quote(entry)}")
             first = group.lstrip("/").split("/")[0]
             # other files in the folder, which a sweep may have left, were not checked; Hydra reports missing ones

@@ -25,7 +25,7 @@ _NUMBER, _TEXT = (int, float), (str, type(None))
 _KINDS: dict[str, tuple[type, ...]] = {
     **dict.fromkeys(("overrides", "command"), (list,)),
     **dict.fromkeys(("key", "status"), (str,)),
-    **dict.fromkeys(("error", "config"), _TEXT),
+    **dict.fromkeys(("error", "config", "handle"), _TEXT),
     **dict.fromkeys(("started", "ended", "processor_seconds", "pid"), (*_NUMBER, type(None))),
     **dict.fromkeys(("number", "tries"), (int,)),
 }

@@ -98,6 +98,33 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
+def try_lock(path: Path) -> tuple[int, OSError | None] | None:
+    """Lock the file `path` without waiting.
+
+    On a file system without `flock`, a POSIX record lock is used, which ends with this process and which other
+    processes do not inherit.
+
+    Returns:
+        Descriptor of the lock, and the error of a file system that has no locks at all; None if another process holds
+        the lock.
+    """
+    descriptor, missing = os.open(path, os.O_RDWR | os.O_CREAT, 0o644), None
+    for lock in (fcntl.flock, fcntl.lockf):
+        try:
+            lock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, PermissionError):
+            os.close(descriptor)
+            return None
+        except OSError as error:
+            if not lacks_locks(error):
+                os.close(descriptor)
+                raise
+            missing = error
+        else:
+            return descriptor, None
+    return descriptor, missing
+
+
 def lock_within(descriptor: int, seconds: float) -> None:
     """Acquire the POSIX record lock of a file, which this process holds until it closes any descriptor of the file.
 

@@ -388,5 +388,9 @@ def _close_parent(folder: Path, files: Sequence[Path], summary: str, config: Map
         tracker.set_tags({DESCRIPTION: f"A sweep in `{folder}`: {summary}"[:LONGEST_DESCRIPTION]})
     for file in files:
         tracker.log_artifact(file)
-    failed = [job for job in find_job_folders(folder) if _status(job) != "completed"]
-    tracker.close("FAILED" if failed else "FINISHED")
+    records = [read_record(job) for job in find_job_folders(folder)]
+    if any(record.get("status") == "running" and record.get("handle") for record in records):
+        tracker.leave_open()  # jobs of an engine go on without this command
+    else:
+        completed = all(record.get("status") == "completed" for record in records)
+        tracker.close("FINISHED" if completed else "FAILED")

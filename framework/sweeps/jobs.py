@@ -1,10 +1,11 @@
-"""Running of a sweep on one machine, with a process and a record per job, several at a time; a sweep can be resumed."""
+"""Running of the jobs of a sweep on an engine, with a record per job, several at a time; a sweep can be resumed."""
 
-import fcntl
 import hashlib
 import json
 import logging
 import os
+import re
+import shutil
 import signal
 import sys
 import time
@@ -19,16 +20,18 @@ from typing import Any
 from framework.errors import ConfigError, UserError
 from framework.runs.job import PARENT, RECORD, VALUE, find_job_folders, read_record
 from framework.storage.enclosed import read_plain, read_stream
-from framework.storage.files import lacks_locks, warn_unlocked, write_whole
+from framework.storage.files import try_lock, warn_unlocked, write_whole
 from framework.storage.names import as_bytes
 from framework.storage.plain_values import plain_numbers
 from framework.storage.reading import translate_errors
-from framework.sweeps.processes import Process, SeparateProcess, Starter
-from framework.tracking.signals import ENDING, SIGNALS, Stopped, ends_with_parent, handled_signals
+from framework.sweeps.engines import CONSOLE, LOCK, Engine
+from framework.sweeps.processes import Process
+from framework.tracking.signals import CLOSED, ENDING, SIGNALS, Stopped, ends_with_parent, handled_signals
 
 COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework")
 """Command of a job, to which its overrides are added. It is no setting, because a config must not run code."""
-CONSOLE = "console.log"
+MOST_LOSSES = 3
+"""Largest number of times that a command starts a job again because the job was lost with its node."""
 LONGEST_VALUE = 4096
 """Largest size, in bytes, of the file with the value that a job returned."""
 
@@ -42,8 +45,9 @@ class Job:
     The record of a job, job.json, has number, overrides, key and config as below. The record also has command, pid,
     tries, started and ended (seconds since 1970, of the last try), processor_seconds, error and status. The processor
     time covers all tries, threads and processes of the job; it is null if the sweep was killed during one of the tries.
-    The status is "queued", "running", "completed", "failed" (the job exited with an error) or "died" (the job was
-    killed, or stopped by a signal).
+    A job that goes on without the sweep also has a handle, the name by which its engine knows it. The status is
+    "queued", "running", "completed", "failed" (the job exited with an error) or "died" (the job was killed, or
+    stopped by a signal).
 
     Attributes:
         number: Number of the job in the sweep.
@@ -53,6 +57,7 @@ class Job:
         key: Hash of the overrides, which identifies the job in the sweep.
         config: Hash of the whole composed config; a job that has completed with the same hash is not run again.
         attempts: Number of times that this command has started the job.
+        losses: Number of times that the job was lost with its node during this command.
         waits: Whether the job waits, because a process of another sweep was found in its folder.
         unlocked: Whether the folder is on a file system without locks.
         record: Content of job.json.
@@ -65,6 +70,7 @@ class Job:
     key: str
     config: str
     attempts: int = 0
+    losses: int = 0
     waits: bool = False
     unlocked: bool = False
     record: dict[str, Any] = field(default_factory=dict)
@@ -73,6 +79,11 @@ class Job:
     def completed(self) -> bool:
         """Return whether the job has completed with its present config."""
         return self.record.get("status") == "completed" and self.record.get("config") == self.config
+
+    @property
+    def is_elsewhere(self) -> bool:
+        """Return whether an engine whose jobs outlive the sweep may still run the job."""
+        return self.record.get("status") == "running" and self.record.get("handle") is not None
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -147,92 +158,118 @@ def reserve(jobs: Sequence[Job]) -> None:
             job.update(**job.identity, status="queued", error=None)
 
 
-def cores() -> int:
-    """Return the number of CPU cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def run(
     jobs: Sequence[Job],
+    engine: Engine,
     *,
     at_once: int,
     retries: int = 0,
     devices: Sequence[str] = (),
     parent: str | None = None,
-    starter: Starter = SeparateProcess,
     store: str | None = None,
+    eager: bool = False,
 ) -> None:
     """Run every job that has not completed, and return when all have ended, successfully or not.
 
+    A job that an earlier command started on an engine whose jobs outlive the command is taken up again. A job that was
+    lost with its node is started again, independently of `retries`.
+
     SIGINT, SIGTERM and SIGHUP are passed on to the jobs, which close their runs. A second signal stops the jobs
-    immediately, and a third kills them.
+    immediately, and a third kills them. If the jobs outlive this process, SIGHUP is not passed on.
 
     Args:
         jobs: Jobs of the sweep.
-        at_once: Number of jobs that run at the same time; each gets an equal part of the cores.
+        engine: Engine that starts the jobs.
+        at_once: Number of jobs that run at the same time.
         retries: Number of times that a job that died is started again.
         devices: CUDA devices to distribute, one to each running job; if empty, all jobs see all devices.
         parent: Id of the tracking run under which the jobs are recorded.
-        starter: Function that starts the process of a job.
         store: Address of the tracking store that the command names.
+        eager: Return as soon as every job has been started and no ended job is left unnoticed. The jobs must outlive
+            this process.
 
     Raises:
         Stopped: A signal was received.
     """
-    queue = deque(job for job in jobs if not job.completed)
+    queue = deque(sorted((job for job in jobs if not job.completed), key=lambda job: not job.is_elsewhere))
     for job in queue:
         job.folder.mkdir(parents=True, exist_ok=True)
         lock = _lock(job)
         if lock is not None:
-            if not (job.folder / RECORD).exists() or (job.reread() and not job.completed):
+            if not (job.folder / RECORD).exists() or (
+                job.reread() and not job.completed and not job.is_elsewhere
+            ):
                 job.update(**job.identity, status="queued", error=None)
             os.close(lock)
     log.info(
         f"{len(jobs)} jobs, {len(jobs) - len(queue)} of them already completed; {at_once} at a time with "
-        f"{max(1, cores() // at_once)} cores each"
+        f"{engine.threads} cores each"
     )
     running: list[_Running] = []
     passed_on = 0
     started_by, orphaned_at = os.getppid(), None
     with _signals() as received, ThreadPoolExecutor(1, "sync") as sending:
         while running or (queue and not received):
+            if engine.outlives and received[:1] == [CLOSED]:
+                log.info(f"The terminal is closed: {len(running)} jobs go on without this command")
+                break
             for number in received[passed_on:]:
                 _pass_on(number, passed_on, running)
                 passed_on += 1
-            if orphaned_at is None and os.getppid() != started_by and ends_with_parent():
+            orphaned = os.getppid() != started_by and ends_with_parent() and not engine.outlives
+            if orphaned_at is None and orphaned:
                 orphaned_at = time.monotonic()
             if orphaned_at is not None and time.monotonic() - orphaned_at > ENDING:
                 for active in running:
                     active.process.kill()
             for _ in range(len(queue)):
-                if received or len(running) == at_once:
+                if received or len(running) >= at_once:
                     break
                 job = queue.popleft()
                 lock = _lock(job)
                 if lock is None:
-                    queue.append(job)
+                    if (attached := _attach(job)) is None:
+                        _wait(job)
+                        queue.append(job)
+                    else:
+                        running.append(attached)
                     continue
                 # Another sweep may have run the job while this one waited for the folder.
                 if not job.reread() or job.completed:
                     os.close(lock)
+                elif (attached := _attach(job)) is not None:
+                    os.close(lock)
+                    running.append(attached)
                 else:
                     slot = min(set(range(at_once)) - {active.slot for active in running})
-                    running.append(
-                        _start(job, slot, lock, _environment(at_once, slot, devices, parent), starter)
-                    )
+                    environment = _environment(engine, slot, devices, parent)
+                    if (started := _start(job, slot, lock, environment, engine)) is not None:
+                        running.append(started)
             for active in list(running):
                 code = active.process.poll()
-                if active.job.record["pid"] != active.process.pid:
+                if active.job.record.get("pid") != active.process.pid:
                     active.job.update(pid=active.process.pid)
                 if code is None:
                     continue
                 running.remove(active)
+                job = active.job
+                if active.lock is None and (
+                    not job.reread() or job.record.get("handle") != active.process.handle
+                ):
+                    queue.append(job)  # another sweep has started the job again
+                    continue
+                if active.lock is None and not job.is_elsewhere:
+                    continue  # another sweep has recorded how the job ended
                 _end(active, code)
                 if parent is not None:
-                    sending.submit(_sync, active.job.folder, store)
-                if active.job.record["status"] == "died" and active.job.attempts <= retries and not received:
-                    queue.append(active.job)
-            time.sleep(0.05)
+                    sending.submit(_sync, job.folder, store)
+                if job.record["status"] == "died" and not received:
+                    job.losses += active.process.lost
+                    if job.attempts - job.losses <= retries and job.losses <= MOST_LOSSES:
+                        queue.append(job)
+            if eager and not queue and all(active.process.alive for active in running):
+                break
+            time.sleep(engine.interval)
     if received:
         raise Stopped(received[0])
 
@@ -249,7 +286,7 @@ def _sync(folder: Path, store: str | None) -> None:
 
 def failure(jobs: Sequence[Job]) -> UserError | None:
     """Return an error that lists the jobs that did not complete; None if all completed."""
-    bad = [job for job in jobs if job.record.get("status") != "completed"]
+    bad = [job for job in jobs if job.record.get("status") != "completed" and not job.is_elsewhere]
     if not bad:
         return None
     lines = [
@@ -267,13 +304,11 @@ class _Running:
     job: Job
     process: Process
     slot: int
-    lock: int
+    lock: int | None
 
 
-def _environment(at_once: int, slot: int, devices: Sequence[str], parent: str | None) -> dict[str, str]:
-    # The cores are divided by `at_once`, not by the number of jobs, because results depend on the number of threads in
-    # the last bits, and a resumed job must give the same bits as an uninterrupted one.
-    environment = {"OMP_NUM_THREADS": str(max(1, cores() // at_once)), **os.environ}
+def _environment(engine: Engine, slot: int, devices: Sequence[str], parent: str | None) -> dict[str, str]:
+    environment = {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", str(engine.threads))}
     # Printed text must be written to the file even if the process is killed.
     environment |= {"PYTHONUNBUFFERED": "1", "PYTHONFAULTHANDLER": "1"}
     if devices:
@@ -290,7 +325,32 @@ def _earlier_seconds(record: Mapping[str, Any], config: str) -> float | None:
     return None if record.get("ended") is None else record.get("processor_seconds")
 
 
-def _start(job: Job, slot: int, lock: int, environment: Mapping[str, str], starter: Starter) -> _Running:
+def _attach(job: Job) -> _Running | None:
+    """Take up a job that an earlier command started, if it still runs and its engine can be asked from here.
+
+    A job whose config has changed since is cancelled instead.
+    """
+    if (job.folder / RECORD).exists() and job.reread() and job.is_elsewhere:
+        process = _process_of(str(job.record["handle"]), job.folder)
+        if process is not None and job.record.get("config") == job.config:
+            log.info(f"#{job.number} was started earlier as {job.record['handle']}")
+            return _Running(job, process, -1, None)
+        if process is not None and not job.waits:
+            process.kill()
+    return None
+
+
+def _process_of(handle: str, folder: Path) -> Process | None:
+    """Return the process of a job that an earlier command started; None if its engine cannot be asked from here."""
+    if not re.fullmatch(r"slurm:[0-9]+", handle) or shutil.which("squeue") is None:
+        return None
+    from framework.sweeps.slurm import SlurmProcess  # imported late: Hydra imports this module at every start
+
+    return SlurmProcess(handle, folder)
+
+
+def _start(job: Job, slot: int, lock: int, environment: Mapping[str, str], engine: Engine) -> _Running | None:
+    """Record that a job starts, and start it; return None if the engine refuses it."""
     job.attempts += 1
     (job.folder / VALUE).unlink(missing_ok=True)
     job.update(
@@ -304,19 +364,28 @@ def _start(job: Job, slot: int, lock: int, environment: Mapping[str, str], start
         ended=None,
         error=None,
         pid=None,
+        handle=None,
     )
-    with (job.folder / CONSOLE).open("ab") as console:
-        process = starter(job.record["command"], environment, console.fileno(), lock)
+    try:
+        process = engine.start(job.record["command"], environment, job.folder, lock)
+    except UserError as error:
+        job.update(status="failed", error=str(error), ended=time.time())
+        os.close(lock)
+        log.info(f"#{job.number} failed: {error}")
+        return None
+    if process.handle is not None:
+        job.update(handle=process.handle)
+        os.close(lock)  # the job acquires the lock where it runs
     log.info(f"#{job.number} started: {' '.join(job.overrides)}")
-    return _Running(job, process, slot, lock)
+    return _Running(job, process, slot, lock if process.handle is None else None)
 
 
 def _end(active: _Running, code: int) -> None:
     """Record how a job ended: its status, its error message and its processor time."""
     job = active.job
     active.process.kill()  # processes that a killed job left behind, such as data loaders and other ranks
-    if active.process.seconds is None:
-        status, error = "died", "its exit code is not known, because its parent process died"
+    if active.process.reason is not None:
+        status, error = "died", active.process.reason
     elif code == 0:
         status, error = "completed", None
     elif code < 0:
@@ -331,7 +400,8 @@ def _end(active: _Running, code: int) -> None:
     seconds = active.process.seconds
     processor_seconds = None if before is None or seconds is None else before + seconds
     job.update(status=status, error=error, ended=time.time(), processor_seconds=processor_seconds)
-    os.close(active.lock)
+    if active.lock is not None:
+        os.close(active.lock)
     log.info(
         f"#{job.number} {status} after {job.record['ended'] - job.record['started']:.1f} s"
         + (f": {error} ({job.folder / CONSOLE})" if error else "")
@@ -371,29 +441,22 @@ def _signals() -> Iterator[list[int]]:
 def _lock(job: Job) -> int | None:
     """Lock the job's folder and return the lock's descriptor; None if a process of another sweep holds the lock.
 
-    On a file system without `flock`, a POSIX record lock is used, which ends with this process. On a file system
-    without either lock, a warning is logged.
+    On a file system without locks, a warning is logged.
     """
-    path = job.folder / ".lock"
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if not lacks_locks(error):
-                raise
-            try:
-                fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as record_error:
-                if not lacks_locks(record_error):
-                    raise
-                if not job.attempts and not job.unlocked:
-                    warn_unlocked(path, record_error)
-                job.unlocked = True
-    except (BlockingIOError, PermissionError):
-        os.close(descriptor)
-        if not job.waits:
-            log.info(f"#{job.number} waits, because a process of another sweep still uses {job.folder}")
-        job.waits = True
+    path = job.folder / LOCK
+    locked = try_lock(path)
+    if locked is None:
         return None
+    descriptor, missing = locked
+    if missing is not None:
+        if not job.attempts and not job.unlocked:
+            warn_unlocked(path, missing)
+        job.unlocked = True
     return descriptor
+
+
+def _wait(job: Job) -> None:
+    """Log once that a job waits for its folder."""
+    if not job.waits:
+        log.info(f"#{job.number} waits, because a process of another sweep still uses {job.folder}")
+    job.waits = True

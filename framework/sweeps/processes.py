@@ -29,9 +29,17 @@ class Process(Protocol):
 
     Attributes:
         seconds: Processor time of all processes of the job; None while it runs, or if its end was not observed.
+        handle: Name by which the engine knows the job, if the job goes on when this process ends; None otherwise.
+        alive: Whether the engine has confirmed that the job waits or runs.
+        reason: What ended the job, in the words of its engine; None if the exit code says it.
+        lost: Whether the job ended because its node failed, so that it is started again.
     """
 
     seconds: float | None
+    handle: str | None
+    alive: bool
+    reason: str | None
+    lost: bool
 
     @property
     def pid(self) -> int | None:
@@ -54,6 +62,15 @@ class Process(Protocol):
         ...
 
 
+class LocalProcess:
+    """Values of `Process` for every process on this machine."""
+
+    handle: str | None = None
+    alive: bool = True
+    reason: str | None = None
+    lost: bool = False
+
+
 Starter = Callable[[Sequence[str], Mapping[str, str], int, int], Process]
 """Type of a function that starts a job.
 
@@ -62,7 +79,7 @@ a lock that is held until the last process of the job has ended.
 """
 
 
-class SeparateProcess:
+class SeparateProcess(LocalProcess):
     """Job in a new Python process, as `Process` describes it; the constructor is a `Starter`."""
 
     def __init__(
@@ -230,7 +247,7 @@ class _Server:
         self._process.wait()
 
 
-class _Fork:
+class _Fork(LocalProcess):
     """Job for which a fork was requested; it gets a separate process if the server dies before the fork."""
 
     def __init__(self, server: _Server, fresh: Callable[[], Process]) -> None:
@@ -269,6 +286,7 @@ class _Fork:
                 ended, status, usage = os.wait4(self.pid, os.WNOHANG)
             except ChildProcessError:  # the server read the exit code and died before it sent the code
                 self._code = -signal.SIGTERM
+                self.reason: str | None = "its exit code is not known, because its parent process died"
             else:
                 if ended:
                     self.end(os.waitstatus_to_exitcode(status), usage.ru_utime + usage.ru_stime)

@@ -1,11 +1,13 @@
-"""Hydra launcher that runs jobs through `framework.sweeps.jobs`.
+"""Hydra launchers that run jobs through `framework.sweeps.jobs`, each on an engine of `framework.sweeps.engines`.
 
 Hydra imports this module at every start; therefore it imports nothing heavy.
 """
 
+import logging
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +23,9 @@ from framework.errors import ConfigError
 from framework.storage.enclosed import require_enclosed
 from framework.storage.files import hold_lock
 from framework.sweeps import jobs as sweep
-from framework.sweeps.processes import Forks, SeparateProcess, Starter
+from framework.sweeps.engines import Engine, Pool, cores
+
+log = logging.getLogger(__name__)
 
 _OF_THE_SWEEP = (
     "hydra/launcher",
@@ -35,30 +39,36 @@ _LOCK = ".numbers.lock"
 _COMPOSING = "framework.configuration.composition"
 
 
-class PoolLauncher(Launcher):
-    """Hydra launcher that runs each job of a sweep in its own process, several at once; see `framework.sweeps.jobs`.
+class EngineLauncher(Launcher):
+    """Hydra launcher whose jobs an engine starts; everything but the engine is the same code for all launchers.
 
     Args:
-        jobs: number of jobs that run at once; None: half the number of cores.
+        jobs: number of jobs that run at once; None: all.
         retries: number of times that a killed job is started again; it resumes from its checkpoint.
-        devices: CUDA devices to assign, one to each running job, such as [0, 1]; None: every job sees all devices.
-        fork: whether jobs are forks of one process that has already imported the modules of their modes, which saves
-            seconds per job; None: fork on Linux if there are several jobs. Every job has its own process in both cases.
+        devices: CUDA devices to assign, one to each running job; None: every job sees all devices.
+        eager: whether the command returns when all jobs have been started.
     """
 
     def __init__(
         self,
-        jobs: int | None = None,
-        retries: int = 0,
+        jobs: int | None,
+        retries: int,
         devices: Sequence[int | str] | None = None,
-        fork: bool | None = None,
+        eager: bool = False,
     ) -> None:
-        self.at_once = jobs or max(1, sweep.cores() // 2)
+        self.at_once = jobs
         self.retries = retries
         self.devices = [str(device) for device in devices or ()]
-        self.fork = fork
+        self.eager = eager
         self.launched: list[list[str]] = []
         self.parent: str | None = None
+
+    def _check(self) -> None:
+        """Raise a ConfigError if the engine is not installed or a setting is wrong; called before any job starts."""
+
+    @abstractmethod
+    def _engine(self, jobs: Sequence[sweep.Job], values: Sequence[Mapping[str, Any]]) -> Engine:
+        """Return the engine that starts the jobs; `values` has the plain config of each job."""
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Store the sweep's config; raise a DataError if the sweep's folder contains a link or a special file."""
@@ -82,6 +92,7 @@ class PoolLauncher(Launcher):
                 f"{' '.join(swept) or 'The sweep'} has no value, so there is no job. Give a range that contains a "
                 "number, or a glob that matches a name."
             )
+        self._check()
         configs = [self.loader.load_sweep_config(self.config, list(overrides)) for overrides in job_overrides]
         # Number the jobs for the rehearsal. It runs before the lock is acquired, because it takes long and others wait.
         for index, config in enumerate(configs, initial_job_idx):
@@ -100,35 +111,26 @@ class PoolLauncher(Launcher):
             self.parent = comparison.begin(folder, values[0])
         self.launched += [job.overrides for job in jobs]
         try:
-            with self._starter(jobs, values) as starter:
+            with closing(self._engine(jobs, values)) as engine:
                 sweep.run(
                     jobs,
-                    at_once=self.at_once,
+                    engine,
+                    at_once=self.at_once or len(jobs),
                     retries=self.retries,
                     devices=self.devices,
                     parent=self.parent,
-                    starter=starter,
                     store=comparison.store_of(values[0]),
+                    eager=self.eager,
                 )
         finally:
             comparison.summarise(folder, self.launched, values[0])
+        if unfinished := sum(job.is_elsewhere for job in jobs):
+            log.info(
+                f"{unfinished} of {len(jobs)} jobs go on without this command. To wait for them and to see the table, "
+                f"repeat the command with hydra.sweep.dir={folder}"
+            )
         failure = sweep.failure(jobs)
         return [_job_return(job, failure) for job in jobs]
-
-    @contextmanager
-    def _starter(self, jobs: Sequence[sweep.Job], values: Sequence[Mapping[str, Any]]) -> Iterator[Starter]:
-        from framework.modes import MODES  # imported late: Hydra imports this module at every start
-
-        several = sum(not job.completed for job in jobs) > 1
-        if not (several and sys.platform == "linux" if self.fork is None else self.fork):
-            yield SeparateProcess
-            return
-        modes = {(config.get("mode") or {}).get("name") for config in values} & set(MODES)
-        forks = Forks([_COMPOSING, *sorted(f"framework.modes.{name}" for name in modes)])
-        try:
-            yield forks
-        finally:
-            forks.close()
 
     def _jobs(
         self, folder: Path, configs: Sequence[DictConfig], job_overrides: Sequence[Sequence[str]], first: int
@@ -180,6 +182,94 @@ class PoolLauncher(Launcher):
         ]
 
 
+class PoolLauncher(EngineLauncher):
+    """Hydra launcher that runs each job of a sweep in its own process on this machine, several at once.
+
+    Args:
+        jobs: number of jobs that run at once; None: half the number of cores.
+        retries: number of times that a killed job is started again; it resumes from its checkpoint.
+        devices: CUDA devices to assign, one to each running job, such as [0, 1]; None: every job sees all devices.
+        fork: whether jobs are forks of one process that has already imported the modules of their modes, which saves
+            seconds per job; None: fork on Linux if there are several jobs. Every job has its own process in both cases.
+    """
+
+    def __init__(
+        self,
+        jobs: int | None = None,
+        retries: int = 0,
+        devices: Sequence[int | str] | None = None,
+        fork: bool | None = None,
+    ) -> None:
+        self.processes = jobs or max(1, cores() // 2)
+        super().__init__(self.processes, retries, devices)
+        self.fork = fork
+
+    def _engine(self, jobs: Sequence[sweep.Job], values: Sequence[Mapping[str, Any]]) -> Engine:
+        from framework.modes import MODES  # imported late: Hydra imports this module at every start
+
+        several = sum(not job.completed for job in jobs) > 1
+        if not (several and sys.platform == "linux" if self.fork is None else self.fork):
+            return Pool(self.processes)
+        modes = {(config.get("mode") or {}).get("name") for config in values} & set(MODES)
+        return Pool(self.processes, [_COMPOSING, *sorted(f"framework.modes.{name}" for name in modes)])
+
+
+class SlurmLauncher(EngineLauncher):
+    """Hydra launcher that submits each job of a sweep to SLURM (`framework.sweeps.slurm`).
+
+    Args:
+        jobs: number of jobs that are submitted at once; None: all.
+        retries: number of times that a killed job is submitted again; it resumes from its checkpoint.
+        eager: whether the command returns when all jobs have been submitted; repeat it for the table.
+        settings: resources of each job; see `SlurmSettings`.
+    """
+
+    def __init__(
+        self, jobs: int | None = None, retries: int = 0, eager: bool = False, **settings: Any
+    ) -> None:
+        super().__init__(jobs, retries, eager=eager)
+        self.settings = settings
+
+    def _check(self) -> None:
+        from framework.configuration.schema import check
+        from framework.sweeps import slurm
+
+        slurm.require_programs()
+        self.checked = slurm.SlurmSettings(**check(slurm.SlurmSettings, self.settings, "hydra.launcher"))
+
+    def _engine(self, jobs: Sequence[sweep.Job], values: Sequence[Mapping[str, Any]]) -> Engine:
+        from framework.sweeps import slurm
+
+        return slurm.Slurm(Path(str(self.config.hydra.sweep.dir)).absolute(), self.checked)
+
+
+class RayLauncher(EngineLauncher):
+    """Hydra launcher that runs each job of a sweep as a task of Ray (`framework.sweeps.ray_tasks`).
+
+    Args:
+        jobs: number of tasks that are submitted at once; None: all, and Ray runs those for which there are resources.
+        retries: number of times that a killed job is started again; it resumes from its checkpoint.
+        settings: cluster, and resources of each job; see `RaySettings`.
+    """
+
+    def __init__(self, jobs: int | None = None, retries: int = 0, **settings: Any) -> None:
+        super().__init__(jobs, retries)
+        self.settings = settings
+
+    def _check(self) -> None:
+        from framework.configuration.schema import check
+        from framework.sweeps import ray_tasks
+        from framework.sweeps.engines import require_module
+
+        require_module("ray", "ray")
+        self.checked = ray_tasks.RaySettings(**check(ray_tasks.RaySettings, self.settings, "hydra.launcher"))
+
+    def _engine(self, jobs: Sequence[sweep.Job], values: Sequence[Mapping[str, Any]]) -> Engine:
+        from framework.sweeps import ray_tasks
+
+        return ray_tasks.Ray(self.checked, connect=not all(job.completed for job in jobs))
+
+
 def _remove_empty_sweep(folder: Path) -> None:
     """Remove the folder of a sweep that never began, if it contains no files but Hydra's multirun.yaml and the lock."""
     files = list(folder.glob("*"))
@@ -191,9 +281,10 @@ def _remove_empty_sweep(folder: Path) -> None:
 
 
 def _job_return(job: sweep.Job, failure: Exception | None) -> JobReturn:
-    status = JobStatus.COMPLETED if job.completed else JobStatus.FAILED
+    # a job that goes on without this command has no value yet, and is no failure
+    status = JobStatus.COMPLETED if job.completed or job.is_elsewhere else JobStatus.FAILED
     job_return = JobReturn(overrides=job.overrides, working_dir=str(job.folder), status=status)
-    job_return.return_value = job.value() if job.completed else failure
+    job_return.return_value = job.value() if job.completed else None if job.is_elsewhere else failure
     return job_return
 
 

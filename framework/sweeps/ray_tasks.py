@@ -1,0 +1,157 @@
+"""Engine that runs the jobs of a sweep as tasks of Ray, on an existing cluster or on a local one.
+
+A task ends with the command that started it, so the jobs do not outlive the command. Tasks are never retried by Ray:
+the sweep starts a job again if its node failed, after the processes of the old one have released the job's folder.
+"""
+
+import logging
+import os
+import secrets
+import signal
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+from uuid import uuid4
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from framework.errors import ConfigError, shorten
+from framework.sweeps.engines import Process
+from framework.sweeps.node import NodeJob, read_node
+
+_PASSED_ON = ("FRAMEWORK_", "MLFLOW_")
+"""Beginnings of the names of environment variables that the jobs receive from this process; Ray passes on none."""
+_OBJECT_STORE = 100_000_000
+"""Bytes of shared memory of a local cluster; the tasks exchange no data."""
+
+
+class RaySettings(BaseModel):
+    """Cluster, and resources of each job, as Ray names them."""
+
+    model_config = ConfigDict(extra="forbid")
+    address: str | None = None
+    cpus: Annotated[int, Field(gt=0)] = 1
+    gpus: Annotated[float, Field(ge=0)] = 0
+    resources: dict[str, float] = {}
+
+
+class Ray:
+    """Engine whose jobs are tasks of Ray.
+
+    Args:
+        settings: Cluster, and resources of each job.
+        connect: Whether there is a job to start, for which the cluster must be reached.
+
+    Raises:
+        ConfigError: The cluster cannot be reached.
+    """
+
+    interval = 0.1
+    outlives = False
+
+    def __init__(self, settings: RaySettings, connect: bool = True) -> None:
+        self.threads = settings.cpus
+        self._ray: Any = None
+        if connect:
+            self._connect(settings)
+
+    def _connect(self, settings: RaySettings) -> None:
+        if settings.address is None:
+            # Ray 2.60 would listen on all addresses of this machine, without a password. It reads these variables
+            # when it is imported.
+            os.environ |= {
+                "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+                "RAY_AUTH_MODE": "token",
+                "RAY_AUTH_TOKEN": secrets.token_hex(32),
+            }
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        import ray
+
+        local = {
+            "include_dashboard": False,
+            "object_store_memory": _OBJECT_STORE,
+            "_node_ip_address": "127.0.0.1",
+        }
+        try:
+            ray.init(
+                address=settings.address or "local",
+                log_to_driver=False,
+                logging_level=logging.ERROR,
+                **({} if settings.address else local),
+            )
+        except Exception as error:  # ConnectionError, or an error of gRPC about the token
+            raise ConfigError(
+                f"The Ray cluster hydra.launcher.address={settings.address} cannot be reached "
+                f"({shorten(' '.join(str(error).split()))}). Give the address of its head node (host:port), and its "
+                "token in RAY_AUTH_TOKEN, or null for a cluster on this machine."
+            ) from error
+        self._ray = ray
+        self._task = ray.remote(
+            num_cpus=settings.cpus,
+            num_gpus=settings.gpus,
+            resources=settings.resources,
+            max_retries=0,
+        )(run_task)
+
+    def start(
+        self, command: Sequence[str], environment: Mapping[str, str], folder: Path, lock: int
+    ) -> Process:
+        handle = f"ray:{uuid4().hex}"
+        passed_on = {name: value for name, value in os.environ.items() if name.startswith(_PASSED_ON)}
+        job = NodeJob(list(command), passed_on | dict(environment), str(folder), str(Path.cwd()), handle)
+        return RayProcess(self._ray, self._task.remote(job), handle, folder)
+
+    def close(self) -> None:
+        if self._ray is not None:
+            self._ray.shutdown()
+
+
+def run_task(job: NodeJob) -> None:
+    """Run a job in a process of Ray."""
+    job()
+
+
+class RayProcess:
+    """Task of Ray, as `Process` describes it."""
+
+    pid = None
+    alive = True
+
+    def __init__(self, ray: Any, reference: Any, handle: str, folder: Path) -> None:
+        self.handle: str | None = handle
+        self.seconds: float | None = None
+        self.reason: str | None = None
+        self.lost = False
+        self._ray = ray
+        self._reference = reference
+        self._folder = folder
+        self._code: int | None = None
+
+    def poll(self) -> int | None:
+        if self._code is None and self._ray.wait([self._reference], timeout=0)[0]:
+            error = None
+            try:
+                self._ray.get(self._reference)
+            except self._ray.exceptions.RayError as raised:
+                error = raised
+            state = read_node(self._folder, str(self.handle))
+            if state is not None and state["code"] is not None:
+                self._code, self.seconds = state["code"], state["seconds"]
+                if state["code"] < 0:
+                    name = signal.Signals(-state["code"]).name
+                    self.reason = f"killed by {name} on {shorten(state['host'])}"
+            else:
+                exceptions = self._ray.exceptions
+                self.lost = isinstance(error, exceptions.NodeDiedError)
+                words = str(error).strip().splitlines() or [""]
+                self.reason = f"ended by Ray: {type(error).__name__}: {shorten(words[0])}"
+                self._code = -signal.SIGKILL
+        return self._code
+
+    def send(self, number: int) -> None:
+        if self._code is None:
+            self._ray.cancel(self._reference)
+
+    def kill(self) -> None:
+        if self._code is None:
+            self._ray.cancel(self._reference, force=True)
