@@ -144,7 +144,7 @@ def rows_section(model: str, folder: Path, before: Path | None) -> str:
     """Return the text about the predictions of a model for `ROWS` rows."""
     predict = ("mode=predict", f"checkpoint={model}", "mode.files=rows.csv")
     bare = (sys.executable, "-c", BARE, model, "rows.csv")
-    lines = {"bare loop over the loaded model": (bare, ROOT)}
+    lines: dict[str, tuple[Sequence[str], Path]] = {"bare loop over the loaded model": (bare, ROOT)}
     for title, code in (("now", ROOT), ("before", before)):
         if code is not None:
             lines[f"mode=predict, {title}"] = (command(*predict), code)

@@ -251,10 +251,11 @@ def _interval_of_angle(density: Distribution, mass: float) -> Interval | None:
         return None
     support = density.support
     assert isinstance(support, Circular)
-    width = density.half_width(mass) if isinstance(density, Symmetric) and support.ranges is None else None
-    if width is not None:
-        first = wrap(density.location.double() - width).squeeze(-1)
-        return _exact_interval(first, first + 2 * width.squeeze(-1))
+    if isinstance(density, Symmetric) and support.ranges is None:
+        width = density.half_width(mass)
+        if width is not None:
+            first = wrap(density.location.double() - width).squeeze(-1)
+            return _exact_interval(first, first + 2 * width.squeeze(-1))
     law = _arc_function(flat)
     low, high = support.ranges[0] if support.ranges is not None else (-math.pi, math.pi)
     # a part of the circle has two ends, so the quantiles start at the lower end
