@@ -10,6 +10,8 @@ NEGLIGIBLE = 1e-17
 """Moments of an absolute value below this one are taken as 0."""
 AHEAD = 256
 """Number of orders above the highest moment at which the recurrence starts, in which an error of its start dies out."""
+FEW = 2**18
+"""Number of moments of single densities up to which they are computed in few calls of torch."""
 AT_ONCE = 2**21
 """Largest number of moments of single densities that are kept in memory at once (16 MiB)."""
 
@@ -64,16 +66,21 @@ def _sum_moments(mean: Tensor, concentration: Tensor, weights: Tensor, start: in
     quotients = torch.empty(highest, *mean.shape, dtype=torch.float64, device=mean.device)
     far = torch.full_like(mean, math.sqrt((start + 1) ** 2 - 0.25))
     following = concentration / (start + 0.5 + torch.hypot(concentration, far))
+    twice = 2 * torch.arange(start + 1, dtype=torch.float64, device=mean.device)
     for order in range(start, 0, -1):
-        following = concentration / (concentration * following).add_(2 * order)
+        following = concentration / torch.addcmul(twice[order], concentration, following)
         if order <= highest:
             quotients[order - 1] = following
-    power = torch.complex(weights, torch.zeros_like(weights))
-    turn = torch.polar(torch.ones_like(mean), mean)
-    into[0] = power.sum(-1)
-    for order in range(1, highest + 1):
-        power *= turn * quotients[order - 1]
-        torch.sum(power, -1, out=into[order])
+    into[0] = weights.sum(-1)
+    if quotients.numel() <= FEW:  # in few calls of torch, each of which takes some microseconds
+        orders = (twice[1 : highest + 1] / 2).reshape(-1, *(1,) * mean.dim())
+        torch.sum(weights * torch.polar(quotients.cumprod(0), orders * mean), -1, out=into[1:])
+    else:  # with multiplications only, in little memory
+        power = torch.complex(weights, torch.zeros_like(weights))
+        turn = torch.polar(torch.ones_like(mean), mean)
+        for order in range(1, highest + 1):
+            power *= turn * quotients[order - 1]
+            torch.sum(power, -1, out=into[order])
     into[0] += into[1] * 0  # a density that is NaN has no moments at all
 
 
