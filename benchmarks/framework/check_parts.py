@@ -206,7 +206,7 @@ and the range over the random seeds. Other processes ran at the same time.
 | --- | --- | --- |
 {chr(10).join(costs)}
 
-{machine("torch")} Command: `python -m benchmarks.framework.check_parts {group}`.
+{machine("torch", "numpy")} Command: `python -m benchmarks.framework.check_parts {group}`.
 """.replace("\n\n\n\n", "\n\n"),
         f"check_{group}",
     )

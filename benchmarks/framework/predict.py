@@ -169,7 +169,7 @@ def main() -> None:
         folder = Path(name)
         write_inputs(folder)
         texts = {
-            section: f"{SECTIONS[section][1](folder, before)}\n\n{machine('torch', 'hydra-core')}"
+            section: f"{SECTIONS[section][1](folder, before)}\n\n{machine('torch', 'hydra-core', 'numpy', 'scipy')}"
             for section in options.sections or SECTIONS
         }
     page = Path(__file__).with_suffix(".md")
