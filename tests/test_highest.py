@@ -13,6 +13,7 @@ from framework.distributions.affine import AffineDensity
 from framework.distributions.batch_shapes import Stacked
 from framework.distributions.density import Mixture
 from framework.distributions.highest import highest
+from framework.distributions.many_components import FEWEST, likeliest_modes
 from framework.distributions.tempering import CircularPower
 from plugins.density_head.gaussian.density import Gaussian
 from plugins.density_head.von_mises.density import VonMises
@@ -141,6 +142,31 @@ def test_humps_of_nested_mixtures_are_highest_together(structure: str) -> None:
         before += int((top - density.log_prob(highest(density, modes)) > 1e-3).sum())
     assert missed <= 1  # of 200: three places are climbed from
     assert before > 3 * missed
+
+
+@pytest.mark.parametrize("kind", KINDS[:3])
+@pytest.mark.parametrize("widths", [(1.0, 1.0), (1e-3, 1e-3), (1e-5, 1e5)])
+def test_the_mode_of_very_many_components_is_as_high_as_their_modes(
+    kind: str, widths: tuple[float, float]
+) -> None:
+    """With so many components the density at their modes is interpolated, over widths that are equal or not."""
+    generator = torch.Generator().manual_seed(5)
+    weights, place, part = torch.rand(3, 2, FEWEST, dtype=torch.float64, generator=generator)
+    low, high = (math.log(width) for width in widths)
+    center, scale = (6 * place - 3)[..., None], (low + (high - low) * part).exp()[..., None]
+    if kind == "angles":
+        components: Distribution = VonMises(center, scale.square().reciprocal())
+    elif kind == "reals":
+        components = Gaussian(center, scale)
+    else:
+        components = Independent(Normal(center, scale, validate_args=False), 1, validate_args=False)
+    density = Mixture(weights, components)
+    modes = components.mode.movedim(1, 0)
+    kept = likeliest_modes(components, density.log_weights, modes)
+    assert kept is not None and len(kept) < len(modes)
+    best = density.log_prob(modes).amax(0)
+    assert (density.log_prob(kept).amax(0) >= best - 1e-4).all()
+    assert (density.log_prob(density.mode) >= best - 1e-4).all()
 
 
 def test_two_overlapping_components_have_their_mode_between_them() -> None:

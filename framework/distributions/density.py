@@ -1,7 +1,7 @@
 """`Mixture`, the density that every ensemble and mixture head returns, and a grid for densities of one angle."""
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import ClassVar
 
 import torch
@@ -13,6 +13,7 @@ from framework.distributions.batch_shapes import Reshaped
 from framework.distributions.circular import Circular, circular, grid
 from framework.distributions.description import one_line
 from framework.distributions.highest import crossings, highest
+from framework.distributions.many_components import FEWEST, likeliest_modes
 from framework.distributions.panels import entropy_of_one, has_range
 from framework.distributions.picked import PickedMixture
 
@@ -111,7 +112,11 @@ class Mixture(Distribution):
 
     @property
     def mode(self) -> Tensor:
-        """Mode: for classes the most likely one, for one component its mode, otherwise a maximum found by `highest`."""
+        """Mode: for classes the most likely one, for one component its mode, otherwise a maximum found by `highest`.
+
+        With `many_components.FEWEST` or more components, the search starts only from the modes of components that
+        `likeliest_modes` finds, where it applies.
+        """
         event = len(self.event_shape)
         if self.log_weights.shape[-1] == 1:
             return self.components.mode.squeeze(-1 - event)
@@ -124,6 +129,10 @@ class Mixture(Distribution):
         if self.event_shape.numel() > 1 and self.log_weights.shape[-1] <= CROSSED:
             modes = self.components.mode.movedim(-1 - event, 0)  # (K, *batch, *event)
             starts = torch.cat([starts, crossings(self.components, modes)])
+        count = self.log_weights.shape[-1]
+        if self.event_shape.numel() == 1 and len(starts) == count >= FEWEST:
+            chosen = likeliest_modes(self.components, self.log_weights, starts)
+            starts = starts if chosen is None else chosen
         return highest(self, starts)
 
     @property
@@ -305,6 +314,16 @@ def _weighted_mean(density: Mixture, parts: Tensor | None, numbers: int = 0) -> 
     weights = density.log_weights.double().softmax(-1)  # float32 weights sum to 1 only to 1e-7
     weights = weights[(..., *(None,) * numbers, slice(None))]
     return torch.where(weights > 0, weights * parts, 0.0).sum(-1).clamp(0, 1)
+
+
+@protocol.highest_region.register
+def _(
+    density: Mixture, value: Tensor, mass: float, equal: Mapping[torch.dtype, float]
+) -> protocol.Region | None:
+    if density.log_weights.shape[-1] > 1:
+        return None
+    region = protocol.highest_region(density.components, value.unsqueeze(-2), mass, equal)
+    return None if region is None else protocol.Region(*(number.squeeze(-1) for number in region))
 
 
 @protocol.normals.register

@@ -21,7 +21,7 @@ In shapes, `*batch` is the batch_shape, `*event` the event_shape, and `*sample` 
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from functools import singledispatch
 from typing import NamedTuple
 
@@ -295,6 +295,36 @@ def weighted_moments(moments: Tensor | None, weights: Tensor | None) -> Tensor |
 def arc_length(start: Tensor, end: Tensor) -> Tensor:
     """Return the angle from `start` counter-clockwise to `end`, radians in [0, 2π], float64."""
     return torch.remainder(end.double() - start.double(), 2 * math.pi)
+
+
+class Region(NamedTuple):
+    """Highest-density regions of each item, (*batch,), float64; such a region holds all values above some density.
+
+    Attributes:
+        low: probability of all values that are denser than a given value.
+        high: probability of all values that are at least as dense.
+        size: size of the region with a given probability, in the unit of the target.
+    """
+
+    low: Tensor
+    high: Tensor
+    size: Tensor
+
+
+@singledispatch
+def highest_region(
+    density: Distribution, value: Tensor, mass: float, equal: Mapping[torch.dtype, float]
+) -> Region | None:
+    """Return the highest-density regions of one number; None if they are not known in closed form (the default).
+
+    Args:
+        density: a density of one number, with batch_shape (*batch).
+        value: (*batch, 1).
+        mass: probability of the region whose size is returned, in (0, 1).
+        equal: relative difference up to which two densities count as equal, so that rounding has no influence; by the
+            dtype of the density, float32 or float64.
+    """
+    return None
 
 
 class Normals(NamedTuple):
