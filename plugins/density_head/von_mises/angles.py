@@ -8,6 +8,8 @@ import math
 import torch
 from torch import Tensor
 
+from plugins.density_head.von_mises.processor import is_transformed
+
 _PI = tuple(
     float.fromhex(part)
     for part in ("0x1.921fb54p+1", "0x1.10b461p-29", "0x1.a62633p-57", "0x1.45c06e0e68948p-85")
@@ -39,8 +41,10 @@ def half_products(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def in_single(value: Tensor, mean: Tensor) -> bool:
-    """Return whether to compute in float32 alone: whether both arguments are float32, and no compiler is active."""
-    return value.dtype == mean.dtype == torch.float32 and not torch.compiler.is_compiling()
+    """Return whether to compute in float32 alone: whether both are float32, and numbers in them may be read."""
+    if torch.compiler.is_compiling() or is_transformed():
+        return False
+    return value.dtype == mean.dtype == torch.float32
 
 
 def _half_angle_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:

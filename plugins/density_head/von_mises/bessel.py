@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from plugins.density_head.von_mises.coefficients import BORDERS, CHAINS, TABLES
+from plugins.density_head.von_mises.processor import is_transformed
 
 _TABLES = {
     (getattr(torch, dtype), name): torch.from_numpy(rows).to(getattr(torch, dtype))
@@ -77,7 +78,7 @@ def _locate(name: str, v: Tensor) -> tuple[Any, Any, Tensor, Any]:
     pieces = rows.shape[1]
     place = v * pieces
     # NaN has no piece: it gets any piece, and stays NaN in y
-    piece = place.detach().to(torch.int32).clamp_(0, pieces - 1)
+    piece = place.detach().to(torch.int32).clamp(0, pieces - 1)
     return rows, piece, 2 * (place - piece) - 1, 2 * pieces
 
 
@@ -106,6 +107,8 @@ def _multiply_add(coefficient: Tensor, total: Tensor, y: Tensor) -> Tensor:
 
     If no gradient is needed, the sum overwrites `coefficient`.
     """
+    if is_transformed():  # transforms do not know the other operations
+        return coefficient + total * y
     if torch.compiler.is_compiling() or (torch.is_grad_enabled() and total.requires_grad | y.requires_grad):
         return torch.addcmul(coefficient, total, y)
     return coefficient.addcmul_(total, y)

@@ -5,6 +5,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from plugins.density_head.von_mises.processor import is_transformed
+
 BLOCK = 2**16
 """Number of elements of a block; the intermediate results of a block stay in the processor's cache."""
 
@@ -12,12 +14,13 @@ BLOCK = 2**16
 def in_blocks(function: Callable[..., tuple[Tensor, ...]], *arguments: Tensor) -> tuple[Tensor, ...]:
     """Return `function(*arguments)` for an elementwise function, computed block by block on the CPU.
 
-    No blocks are used in compiled code, on other devices, for at most BLOCK elements, and for arguments of different
-    shapes.
+    No blocks are used in compiled code, in transforms of torch.func, on other devices, for at most BLOCK elements, and
+    for arguments of different shapes.
     """
     first = arguments[0]
     if (
         torch.compiler.is_compiling()
+        or is_transformed()
         or first.device.type != "cpu"
         or first.numel() <= BLOCK
         or any(argument.shape != first.shape for argument in arguments)

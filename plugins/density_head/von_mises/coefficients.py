@@ -4,7 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-with np.load(Path(__file__).with_name("coefficients.npz"), allow_pickle=False) as _file:
+SOURCE = Path(__file__).with_name("coefficients.npz")
+
+with np.load(SOURCE, allow_pickle=False) as _file:
     _ARRAYS: dict[str, np.ndarray] = {key: _file[key] for key in _file.files}
 
 

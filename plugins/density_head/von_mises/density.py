@@ -1,5 +1,7 @@
 """Independent von Mises angles as a torch distribution."""
 
+from collections.abc import Mapping
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -9,10 +11,12 @@ from framework.distributions.circular import circular
 from framework.distributions.exported import Exported, exported
 from framework.distributions.protocol import (
     QuadraticBound,
+    Region,
     arc_length,
     arc_probability,
     estimate,
     exact_estimate,
+    highest_region,
     marginal,
     pick,
     quadratic_bound,
@@ -23,6 +27,7 @@ from framework.distributions.protocol import (
 )
 from framework.distributions.symmetric import Symmetric
 from plugins.density_head.von_mises import functions, integrals, moments
+from plugins.density_head.von_mises.processor import is_transformed
 
 LARGEST = {torch.float32: torch.finfo(torch.float32).max, torch.float64: 1e300}
 """Largest κ of each dtype; a larger κ is replaced by it, so that all results stay finite numbers.
@@ -47,15 +52,8 @@ class VonMises(Symmetric):
     def __init__(
         self, mean: Float[Tensor, "*batch angle"], concentration: Float[Tensor, "*batch angle"]
     ) -> None:
-        negative = concentration.detach() < 0
-        if not torch.compiler.is_exporting() and bool(negative.any()):
-            raise ValueError(
-                f"{int(negative.sum())} of {negative.numel()} concentrations are negative, the first of them is "
-                f"{concentration.detach()[negative][0].item():g}; expected κ ≥ 0. Add π to the mean instead of using a "
-                "negative κ."
-            )
         self.location = mean
-        self.concentration = concentration.clamp(max=LARGEST[concentration.dtype])
+        self.concentration = _in_range(concentration)
         super().__init__(mean.shape[:-1], mean.shape[-1:], validate_args=False)
 
     @property
@@ -65,7 +63,7 @@ class VonMises(Symmetric):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log-density, nats, (*sample, *batch)."""
-        return functions.log_prob(value, self.location, self.concentration).sum(-1)
+        return _sum(functions.log_prob(value, self.location, self.concentration))
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         """Return samples, (*sample, *batch, *event)."""
@@ -80,6 +78,31 @@ class VonMises(Symmetric):
         """Return half the width of the arc around each mean with probability `mass`, radians, float64."""
         concentration = self.concentration.double()
         return integrals.half_width(torch.full_like(concentration, mass), concentration)
+
+
+def _in_range(concentration: Tensor) -> Tensor:
+    """Return κ, at most LARGEST; raise a ValueError if one is negative."""
+    largest = LARGEST.get(concentration.dtype, torch.finfo(concentration.dtype).max)
+    if is_transformed() or torch.compiler.is_exporting():  # no number may be read
+        return concentration.clamp(max=largest)
+    if concentration.numel() == 0:
+        return concentration
+    low, high = concentration.detach().aminmax()
+    if bool((low >= 0) & (high <= largest)):
+        return concentration
+    negative = concentration.detach() < 0
+    if bool(negative.any()):
+        raise ValueError(
+            f"{int(negative.sum())} of {negative.numel()} concentrations are negative, the first of them is "
+            f"{concentration.detach()[negative][0].item():g}; expected κ ≥ 0. Add π to the mean instead of using a "
+            "negative κ."
+        )
+    return concentration.clamp(max=largest)
+
+
+def _sum(terms: Tensor) -> Tensor:
+    """Return the sum over the last dimension; a sum of one term takes no time."""
+    return terms.squeeze(-1) if terms.shape[-1] == 1 else terms.sum(-1)
 
 
 estimate.register(VonMises, exact_estimate)
@@ -142,3 +165,14 @@ def _(density: VonMises, count: int, weights: Tensor | None = None) -> Tensor:
 def _(density: VonMises) -> Exported:
     parameters = {"location": density.location, "concentration": density.concentration}
     return Exported("von_mises", parameters, code="plugins.density_head.von_mises.numpy_von_mises")
+
+
+@highest_region.register
+def _(density: VonMises, value: Tensor, mass: float, equal: Mapping[torch.dtype, float]) -> Region:
+    mean, concentration = (
+        number.detach().squeeze(-1) for number in (density.location, density.concentration)
+    )
+    double = torch.float64 in (value.dtype, mean.dtype, concentration.dtype)
+    tolerance = equal[torch.float64 if double else torch.float32]
+    low, high = integrals.mass_above(value.squeeze(-1), mean, concentration, tolerance)
+    return Region(low, high, 2 * density.half_width(mass).squeeze(-1))

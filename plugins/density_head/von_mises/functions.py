@@ -4,9 +4,9 @@ No function subtracts two large numbers that nearly agree. The density is writte
 exp(-2κ sin²((φ-μ)/2)). The Bessel functions are computed by polynomials (coefficients.py) of functions that are smooth
 from κ = 0 to infinity. Arguments broadcast, are float32 or float64, and κ ≥ 0 is finite.
 
-The density's value and derivatives come from one pass, also under torch.compile; without a compiler the pass runs in
-blocks that fit a processor's cache. The difference of the angles is in angles.py, the Bessel functions are in
-bessel.py, and integrals of the density are in integrals.py.
+The density's value and derivatives come from one pass, also under torch.compile. Large tensors on the CPU are computed
+by compiled code (processor.py), others by torch operations, in blocks that fit a processor's cache. The difference of
+the angles is in angles.py, the Bessel functions are in bessel.py, and integrals of the density are in integrals.py.
 """
 
 import math
@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
+from plugins.density_head.von_mises import processor
 from plugins.density_head.von_mises.angles import half_angle, half_products, in_single, parts_in_single
 from plugins.density_head.von_mises.bessel import deviation_of, height_and_deviation, log_height, polynomial
 from plugins.density_head.von_mises.blocks import BLOCK, in_blocks
@@ -32,43 +33,37 @@ def log_prob(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
 
     The difference φ-μ is not rounded. float32 angles of any size are read modulo 2π exactly (compiled: up to 4e8
     radians). float64 angles are read exactly up to 4e8 radians; larger ones have an error of one unit of their last
-    digit.
+    digit. Arguments in half precision are computed in float32.
     """
     dtype = torch.promote_types(torch.promote_types(value.dtype, mean.dtype), concentration.dtype)
+    if dtype.itemsize < 4:
+        return log_prob(value.float(), mean.float(), concentration.float()).to(dtype)
     value, mean, concentration = value.to(dtype), mean.to(dtype), concentration.to(dtype)
-    if torch.is_grad_enabled() and (value.requires_grad or mean.requires_grad or concentration.requires_grad):
-        return _LogProb.apply(value, mean, concentration)[0]
-    return in_blocks(_value, value, mean, concentration)[0]
-
-
-def log_prob_and_slopes(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return log p, nats, and its derivatives with respect to the mean and to κ, in one pass.
-
-    The derivatives are κ sin(φ-μ) and 1 - A(κ) - 2 sin²((φ-μ)/2). All arguments have the same dtype, and the results
-    have no gradient. Autograd on `log_prob` gives the same derivatives. But a compiler turns `log_prob` and its
-    gradient into two loops that repeat much of the computation, and this function into one loop.
-    """
-    return _value_and_slopes(value, mean, concentration)
+    needs_gradient = value.requires_grad or mean.requires_grad or concentration.requires_grad
+    if (torch.is_grad_enabled() and needs_gradient) or processor.is_transformed():
+        return _apply(_LogProb, value, mean, concentration)[0]
+    results = processor.density(value, mean, concentration, slopes=False)
+    return (results or in_blocks(_value, value, mean, concentration))[0]
 
 
 def log_peak(concentration: Tensor) -> Tensor:
     """Return the log-density at the mean, κ - log(2π I0(κ)), nats."""
-    return _LogPeak.apply(concentration)
+    return _apply(_LogPeak, concentration)
 
 
 def mean_resultant(concentration: Tensor) -> Tensor:
     """Return A(κ) = I1(κ)/I0(κ) = E cos(φ-μ), to full relative precision for small and large κ."""
-    return _Ratio.apply(concentration)
+    return _apply(_Ratio, concentration)
 
 
 def mean_deviation(concentration: Tensor) -> Tensor:
     """Return 1 - A(κ) = E 2 sin²((φ-μ)/2), to full relative precision for small and large κ."""
-    return _OneMinusRatio.apply(concentration)
+    return _apply(_OneMinusRatio, concentration)
 
 
 def entropy(concentration: Tensor) -> Tensor:
     """Return the entropy κ(1 - A(κ)) - log_peak(κ), nats; its derivative is -κ A'(κ)."""
-    return _Entropy.apply(concentration)
+    return _apply(_Entropy, concentration)
 
 
 def mean_resultant_slope(concentration: Tensor) -> Tensor:
@@ -114,6 +109,9 @@ def sample(mean: Tensor, concentration: Tensor) -> Tensor:
     last proposal, so that the loop always ends.
     """
     mean, concentration = torch.broadcast_tensors(mean, concentration)
+    samples = processor.sample(mean, concentration, BLOCK, SAMPLING_ROUNDS)
+    if samples is not None:
+        return samples
     kappa = concentration.double().flatten()
     block = BLOCK if kappa.device.type == "cpu" else max(1, kappa.numel())
     half_tangent = torch.cat([_half_tangent(part) for part in kappa.split(block)])
@@ -182,44 +180,70 @@ def fall(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
     return -2 * (concentration * sine) * sine
 
 
+def _apply(function: type[Function], *arguments: Tensor) -> Any:
+    """Return the result of an autograd function.
+
+    `Function.apply` first binds the arguments to the signature of `forward`. That takes a tenth of the time for few
+    elements, and is only needed in transforms and compiled code.
+    """
+    if torch.compiler.is_compiling() or processor.is_transformed():
+        return function.apply(*arguments)
+    return super(Function, function).apply(*arguments)  # pyright: ignore[reportAttributeAccessIssue]
+
+
 class _LogProb(Function):
     """Autograd function of the log-density.
 
     `forward` computes the value and all derivatives in one pass, and `backward` only multiplies.
     """
 
-    @staticmethod
-    def forward(
-        ctx: Any, value: Tensor, mean: Tensor, concentration: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        log_p, by_mean, by_concentration = in_blocks(_value_and_slopes, value, mean, concentration)
-        ctx.save_for_backward(value, mean, concentration, by_mean, by_concentration)
-        ctx.mark_non_differentiable(by_mean, by_concentration)
-        return log_p, by_mean, by_concentration
+    generate_vmap_rule = True
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+    def forward(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, ...]:
+        results = processor.density(value, mean, concentration, slopes=True)
+        return results or in_blocks(_value_and_slopes, value, mean, concentration)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
+        ctx.save_for_backward(*inputs, *output[1:])
+        ctx.mark_non_differentiable(*output[1:])
+        ctx.set_materialize_grads(False)  # otherwise zeros are made for the outputs that have no gradient
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
+        if grad is None:
+            return None, None, None
         value, mean, concentration, by_mean, by_concentration = ctx.saved_tensors
         if torch.is_grad_enabled() and not torch.compiler.is_compiling():
             # For second derivatives, the first ones are computed by differentiable operations.
             sine, cosine = half_angle(value, mean)
             by_mean = 2 * concentration * sine * cosine
             by_concentration = mean_deviation(concentration) - 2 * sine * sine
-        turning = grad * by_mean
+        turning, of_concentration = processor.multiply(grad, by_mean, by_concentration)
         needed = ctx.needs_input_grad
         return (
             (-turning).sum_to_size(value.shape) if needed[0] else None,
             turning.sum_to_size(mean.shape) if needed[1] else None,
-            (grad * by_concentration).sum_to_size(concentration.shape) if needed[2] else None,
+            of_concentration.sum_to_size(concentration.shape) if needed[2] else None,
         )
 
 
-class _LogPeak(Function):
+class _OfConcentration(Function):
+    """Base of the autograd functions of κ alone."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+
+
+class _LogPeak(_OfConcentration):
     """Autograd function of the log-density at the mean, whose derivative with respect to κ is 1 - A(κ)."""
 
     @staticmethod
-    def forward(ctx: Any, concentration: Tensor) -> Tensor:
-        ctx.save_for_backward(concentration)
+    def forward(concentration: Tensor) -> Tensor:
         return log_height(concentration)
 
     @staticmethod
@@ -228,12 +252,11 @@ class _LogPeak(Function):
         return grad * mean_deviation(concentration)
 
 
-class _OneMinusRatio(Function):
+class _OneMinusRatio(_OfConcentration):
     """Autograd function of 1 - A(κ), whose derivative is -A'(κ)."""
 
     @staticmethod
-    def forward(ctx: Any, concentration: Tensor) -> Tensor:
-        ctx.save_for_backward(concentration)
+    def forward(concentration: Tensor) -> Tensor:
         return deviation_of(concentration)
 
     @staticmethod
@@ -242,12 +265,11 @@ class _OneMinusRatio(Function):
         return -grad * mean_resultant_slope(concentration)
 
 
-class _Ratio(Function):
+class _Ratio(_OfConcentration):
     """Autograd function of A(κ), whose derivative is A'(κ)."""
 
     @staticmethod
-    def forward(ctx: Any, concentration: Tensor) -> Tensor:
-        ctx.save_for_backward(concentration)
+    def forward(concentration: Tensor) -> Tensor:
         part = 1 / (1 + 2 / concentration)  # κ/(κ+2), without overflow, 0 at κ = 0
         return polynomial("ratio", 2 / (concentration + 2)) * part
 
@@ -257,10 +279,9 @@ class _Ratio(Function):
         return grad * mean_resultant_slope(concentration)
 
 
-class _Entropy(Function):
+class _Entropy(_OfConcentration):
     @staticmethod
-    def forward(ctx: Any, concentration: Tensor) -> Tensor:
-        ctx.save_for_backward(concentration)
+    def forward(concentration: Tensor) -> Tensor:
         height, deviation = height_and_deviation(concentration)
         # 0 · inf at infinite κ, where κ(1 - A) is 1/2
         return torch.where(concentration.isinf(), 0.5, concentration * deviation) - height

@@ -102,6 +102,25 @@ def half_width(mass: Tensor, concentration: Tensor) -> Tensor:
     return width.to(dtype)
 
 
+@torch.no_grad()
+def mass_above(value: Tensor, mean: Tensor, concentration: Tensor, equal: float) -> tuple[Tensor, Tensor]:
+    """Return the probability of all angles that are denser than `value`, and of all that are at least as dense.
+
+    These angles form an arc around the mean. Its ends are where the logarithm of the density is above, or below, that
+    at `value` by `equal`, so that the two probabilities are 0 and 1 for the uniform density. Both are float64.
+    """
+    kappa = concentration.double()
+    sine, cosine = half_angle(value.double(), mean.double())
+    square, rest = sine * sine, cosine * cosine
+    change = equal / (2 * kappa)
+    both = torch.stack([(square - change).clamp(min=0), (square + change).clamp(max=1)])
+    outside = torch.stack([(rest + change).clamp(max=1), (rest - change).clamp(min=0)])
+    within = (kappa * both < 0.1) & (both < outside)
+    side, _ = _one_side(both.sqrt(), outside.sqrt(), kappa, within, height_and_deviation(kappa))
+    low, high = torch.where(within, 2 * side, 1 - 2 * side)
+    return low, high
+
+
 def interval(mass: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor]:
     """Return both ends, radians, of the shortest arc with the probability `mass`.
 

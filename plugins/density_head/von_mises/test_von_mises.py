@@ -1,6 +1,7 @@
 import math
 import subprocess
 import sys
+from contextlib import contextmanager
 from functools import cache
 
 import mpmath
@@ -17,7 +18,7 @@ from framework.distributions.protocol import arc_probability, marginal, median, 
 from framework.errors import ConfigError
 from framework.target import Target
 from framework.testing.head_subject import values
-from plugins.density_head.von_mises import blocks, fit_coefficients, functions, integrals
+from plugins.density_head.von_mises import blocks, fit_coefficients, functions, integrals, processor
 from plugins.density_head.von_mises.bessel import polynomial
 from plugins.density_head.von_mises.coefficients import NODES, TABLES
 from plugins.density_head.von_mises.density import LARGEST, VonMises
@@ -90,10 +91,27 @@ def check_points(value, mean, concentration, log_prob, slopes):
         assert by_mean == -by_value
 
 
+@contextmanager
+def way(fewest):
+    """Compute tensors of at least `fewest` elements by compiled code (numba), and others by torch operations."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(processor, "FEWEST", fewest)
+        yield
+
+
+WAYS = {"compiled": 0, "torch": math.inf}
+both_ways = pytest.mark.parametrize("fewest", list(WAYS.values()), ids=list(WAYS))
+
+
 def check_point(value, mean, concentration):
-    log_prob = functions.log_prob(value, mean, concentration)
-    slopes = torch.autograd.grad(log_prob, (value, mean, concentration))
-    check_points(value, mean, concentration, log_prob, slopes)
+    for fewest in WAYS.values():
+        with way(fewest):
+            log_prob = functions.log_prob(value, mean, concentration)
+            slopes = torch.autograd.grad(log_prob, (value, mean, concentration))
+            check_points(value, mean, concentration, log_prob, slopes)
+            assert abs(
+                functions.log_prob(*(x.detach() for x in (value, mean, concentration))) - log_prob
+            ) <= (4 * torch.finfo(value.dtype).eps * max(1, concentration.item(), abs(log_prob.item())))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -171,14 +189,16 @@ def test_the_coefficients_are_those_the_script_writes(which, name):
     assert all(tuple(fit_coefficients.gauss_legendre(count)) == pairs for count, pairs in NODES.items())
 
 
+@both_ways
 @pytest.mark.parametrize("concentration", [0.0, 1e-6, 0.5, 3.75, 20.0, 1e3])
-def test_first_and_second_derivatives_agree_with_finite_differences(concentration):
+def test_first_and_second_derivatives_agree_with_finite_differences(concentration, fewest):
     arguments = [
         torch.tensor(numbers, dtype=torch.float64, requires_grad=True)
         for numbers in ([[0.3], [-2.0]], [0.1, 3.0], [concentration] * 2)
     ]
-    assert torch.autograd.gradcheck(functions.log_prob, arguments)
-    assert torch.autograd.gradgradcheck(functions.log_prob, arguments)
+    with way(fewest):
+        assert torch.autograd.gradcheck(functions.log_prob, arguments)
+        assert torch.autograd.gradgradcheck(functions.log_prob, arguments)
     for function in (functions.entropy, functions.mean_resultant, functions.mean_deviation):
         assert torch.autograd.gradcheck(function, arguments[2:])
         assert torch.autograd.gradgradcheck(function, arguments[2:])
@@ -193,22 +213,109 @@ def test_gradients_reduce_over_broadcast_arguments():
     torch.testing.assert_close(kappa.grad, spread[1].grad.sum())
 
 
-# the compiler itself raises this warning
-@pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
+def log_prob_and_gradients(*arguments):
+    log_prob = functions.log_prob(*arguments)
+    leaves = [argument for argument in arguments if argument.requires_grad]
+    return [log_prob.detach(), *torch.autograd.grad(log_prob.sum(), leaves)]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_compiled_code_and_torch_operations_agree(dtype):
+    """Compare all concentrations and differences, also NaN and infinite ones, in one tensor that both ways compute."""
+    columns = [(3.0 + off, 3.0, kappa) for off in OFFSETS for kappa in CONCENTRATIONS]
+    unusual = [
+        (math.nan, 0, 1),
+        (1, math.nan, 1),
+        (1, 0, math.nan),
+        (math.inf, 0, 1),
+        (1e30, 0, 2),
+        (1, 0, math.inf),
+    ]
+    for rows in (columns, unusual):
+        results = []
+        for fewest in WAYS.values():
+            with way(fewest):
+                results.append(
+                    log_prob_and_gradients(*(leaf(column, dtype) for column in zip(*rows, strict=True)))
+                )
+        value, mean, kappa = (
+            torch.tensor(column, dtype=dtype).double() for column in zip(*rows, strict=True)
+        )
+        # log p and its derivative by κ are differences of two terms; rounding is relative to the terms
+        fall, eps = 2 * torch.sin((value - mean) / 2) ** 2, torch.finfo(dtype).eps
+        turning = kappa * (torch.sin(value - mean).abs() + eps)
+        scales = 1 + kappa * fall, turning, turning, fall + functions.mean_deviation(kappa)
+        for compiled, reference, scale in zip(*results, scales, strict=True):
+            assert torch.equal(compiled.isnan(), reference.isnan())
+            same = (compiled == reference) | reference.isnan()
+            limit = 6 * eps * torch.maximum(reference.abs().double(), scale) + torch.finfo(dtype).tiny
+            assert (same | ((compiled - reference).abs() <= limit)).all()
+
+
+@both_ways
+def test_every_layout_gives_the_same_numbers(fewest):
+    """Strides, expanded and empty tensors, broadcasting and half precision change at most rounding."""
+    wide = torch.rand(6, 7, 3)
+    value, mean, kappa = wide.movedim(-1, 0)  # strides of 3 numbers
+    for arguments in (
+        (value, mean, kappa),
+        (value.T, mean.T, kappa.T),
+        (value[:, :1], mean[:1].expand(6, 7), kappa[0, 0]),
+        (value[::2, ::3], mean[::2, 0, None], kappa[0, ::3].expand(3, 3)),
+        (value[:0], mean[:0], kappa[:0]),
+    ):
+        arguments = [argument.detach().requires_grad_() for argument in arguments]
+        with way(fewest):
+            results = log_prob_and_gradients(*arguments)
+        plain = [argument.detach().double().contiguous().requires_grad_() for argument in arguments]
+        with way(math.inf):
+            reference = log_prob_and_gradients(*plain)
+        for result, wanted in zip(results, reference, strict=True):
+            torch.testing.assert_close(result, wanted.float())
+    for dtype in (torch.float16, torch.bfloat16):
+        with way(fewest):
+            half = [argument.to(dtype) for argument in (value, mean, kappa)]
+            log_prob = VonMises(half[1], half[2]).log_prob(half[0])
+            assert log_prob.dtype == dtype
+            exact = functions.log_prob(*(argument.float() for argument in half)).sum(-1)
+        torch.testing.assert_close(log_prob.float(), exact, rtol=2e-2, atol=2e-2)
+
+
+@both_ways
+def test_transforms_of_torch_func_see_the_same_density(fewest):
+    value, mean, kappa = torch.randn(3, 40, dtype=torch.float64)
+    kappa = kappa.exp()
+
+    def density(value, mean, kappa):
+        return VonMises(mean[None], kappa[None]).log_prob(value[None])
+
+    with way(fewest):
+        mapped = torch.func.vmap(density)(value, mean, kappa)
+        slopes = torch.func.vmap(torch.func.grad(density, (0, 1, 2)))(value, mean, kappa)
+        curvature = torch.func.vmap(torch.func.grad(torch.func.grad(density, 2), 2))(value, mean, kappa)
+        leaves = [argument.clone().requires_grad_() for argument in (value, mean, kappa)]
+        log_prob = functions.log_prob(*leaves)
+        gradients = torch.autograd.grad(log_prob.sum(), leaves)
+    torch.testing.assert_close(mapped, log_prob.detach())
+    for slope, gradient in zip(slopes, gradients, strict=True):
+        torch.testing.assert_close(slope, gradient)
+    torch.testing.assert_close(curvature, -functions.mean_resultant_slope(kappa))
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_blocks_change_nothing(dtype):
+    """Compare one tensor in blocks, the same tensor in one pass, and its parts."""
     count = blocks.BLOCK * 2 + 5
     value, mean, kappa = torch.randn(count, dtype=dtype), torch.randn(count, dtype=dtype), torch.rand(count)
     arguments = [value, mean.requires_grad_(), kappa.to(dtype).requires_grad_()]
-    whole = functions.log_prob(*arguments)
-    gradients = torch.autograd.grad(whole.sum(), arguments[1:])
-    for part in torch.arange(count).split(1000):
-        few = functions.log_prob(*(argument[part] for argument in arguments))
-        torch.testing.assert_close(
-            whole[part], few, rtol=16 * torch.finfo(dtype).eps, atol=4 * torch.finfo(dtype).eps
-        )
-    in_one_pass = functions.log_prob(value[:, None], mean[:, None], kappa[:, None].to(dtype))
-    torch.testing.assert_close(whole, in_one_pass[:, 0])
+    tolerance = {"rtol": 16 * torch.finfo(dtype).eps, "atol": 4 * torch.finfo(dtype).eps}
+    with way(math.inf):
+        whole, *gradients = log_prob_and_gradients(*arguments)
+        for part in torch.arange(count).split(1000):
+            few = functions.log_prob(*(argument[part] for argument in arguments))
+            torch.testing.assert_close(whole[part], few.detach(), **tolerance)
+        in_one_pass = functions.log_prob(value[:, None], mean[:, None], kappa[:, None].to(dtype))
+    torch.testing.assert_close(whole, in_one_pass[:, 0].detach())
     assert gradients[0].shape == gradients[1].shape == (count,)
 
 
@@ -377,9 +484,16 @@ def test_concentration_of_moments_at_its_ends():
 
 @pytest.mark.parametrize("concentration", [0, 1e-30, 1e-3, 0.5, 1, 3, 30, 1e3, 1e6, 1e12, 1e16, 1e30])
 def test_samples_follow_the_density(concentration):
-    torch.manual_seed(3)
     count = 20_000
-    samples = functions.sample(torch.zeros(count, dtype=torch.float64), torch.full((count,), concentration))
+    ways = []
+    for fewest in WAYS.values():
+        torch.manual_seed(3)
+        with way(fewest):
+            ways.append(
+                functions.sample(torch.zeros(count, dtype=torch.float64), torch.full((count,), concentration))
+            )
+    samples, by_torch = ways
+    torch.testing.assert_close(samples, by_torch, rtol=1e-11, atol=1e-14 / max(1, concentration) ** 0.5)
     assert samples.abs().max() <= math.pi
     if concentration > 1e6:  # there the density is normal to 1/κ
         law = stats.norm(scale=concentration**-0.5).cdf
@@ -389,16 +503,22 @@ def test_samples_follow_the_density(concentration):
     assert len(samples.unique()) > 0.999 * count
 
 
-def test_sampling_ends_whatever_it_is_given():
-    samples = functions.sample(torch.zeros(4), torch.tensor([math.nan, math.inf, 0.0, 1e38]))
+@both_ways
+def test_sampling_ends_whatever_it_is_given(fewest):
+    with way(fewest):
+        samples = functions.sample(torch.zeros(4), torch.tensor([math.nan, math.inf, 0.0, 1e38]))
     assert samples[0].isnan()
     assert samples[2:].isfinite().all()
     assert functions.sample(torch.zeros(0, 2), torch.zeros(0, 2)).shape == (0, 2)
 
 
-def test_sampling_shifts_by_the_mean():
+@both_ways
+def test_sampling_shifts_by_the_mean(fewest):
     torch.manual_seed(0)
-    samples = functions.sample(torch.full((1000,), 1e4 + 1.0, dtype=torch.float64), torch.full((1000,), 1e8))
+    with way(fewest):
+        samples = functions.sample(
+            torch.full((1000,), 1e4 + 1.0, dtype=torch.float64), torch.full((1000,), 1e8)
+        )
     torch.testing.assert_close((samples - 1e4 - 1.0).cos(), torch.ones(1000).double(), rtol=0, atol=1e-6)
 
 
@@ -513,12 +633,14 @@ def test_other_targets_are_refused(kind):
         build_head(target=Target(kind, ("a", "b")))
 
 
+@both_ways
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_angles_of_any_size_are_read_as_the_docstring_says(dtype, monkeypatch):
+def test_angles_of_any_size_are_read_as_the_docstring_says(dtype, fewest, monkeypatch):
     """Check the density at large angles, also with gradient and in compiled code.
 
     float32 angles are read exactly; float64 angles beyond 4e8 radians have an error of one unit of their last digit.
     """
+    monkeypatch.setattr(processor, "FEWEST", fewest)
     value = torch.logspace(6, 38, 129, dtype=torch.float64).to(dtype)
     value = torch.cat([value, -value])
     mean, kappa = torch.full_like(value, 0.7), torch.full_like(value, 2.0)

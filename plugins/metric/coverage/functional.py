@@ -15,7 +15,7 @@ from torch.distributions import Distribution
 from framework.distributions.circular import Circular
 from framework.distributions.circular_moments import CircularMoments, circular_moments
 from framework.distributions.class_probabilities import class_probabilities, require_labels
-from framework.distributions.protocol import mahalanobis, normals
+from framework.distributions.protocol import Region, highest_region, mahalanobis, normals
 
 EQUAL = {torch.float32: 1e-6, torch.float64: 1e-12}
 """Relative difference, for each dtype, below which two densities count as equal, so that rounding has no influence."""
@@ -29,28 +29,14 @@ SECANTS = 2
 """Number of secant steps to the level of a region of a given mass; the grid brackets the level to about 10 %."""
 
 
-class Border(NamedTuple):
-    """Masses and size of the highest-density regions of each item, (batch,), float64.
-
-    Attributes:
-        low: mass of all values that are strictly denser than the target.
-        high: mass of all values that are at least as dense as the target. If the target is drawn from the density, a
-            number drawn uniformly between `low` and `high` is uniform on [0, 1].
-        size: size of the highest-density region with the given mass, in labels, radians or the unit of the target; NaN
-            for a target of several numbers.
-    """
-
-    low: Tensor
-    high: Tensor
-    size: Tensor
-
-
-def border(density: Distribution, value: Tensor, mass: float, samples: int) -> Border:
+def border(density: Distribution, value: Tensor, mass: float, samples: int) -> Region:
     """Return the masses and the size of highest-density regions.
 
-    They are exact for classes, for normal densities, and for an angle whose density a grid resolves. Otherwise they are
-    estimated from `samples` draws: the masses follow from the rank of the target's density among those of the draws.
-    This rank depends on the draws, but it is exactly uniform if the density is the true one.
+    They are exact for classes, for normal densities, where `highest_region` knows them, and for an angle whose density
+    a grid resolves. Otherwise they are estimated from `samples` draws: the masses follow from the rank of the target's
+    density among those of the draws. This rank depends on the draws, but it is exactly uniform if the density is the
+    true one. The size is in labels, radians or the unit of the target, and NaN for a target of several numbers. If the
+    target is drawn from the density, a number drawn uniformly between the masses `low` and `high` is uniform on [0, 1].
 
     Args:
         density: batch_shape (batch,).
@@ -61,13 +47,16 @@ def border(density: Distribution, value: Tensor, mass: float, samples: int) -> B
     if density.has_enumerate_support:
         return class_border(density, value, mass)
     single_number = tuple(density.event_shape) == (1,)
+    region = highest_region(density, value, mass, EQUAL) if single_number else None
+    if region is not None:
+        return region
     if single_number and isinstance(density.support, Circular):
         moments = circular_moments(density)
         exact = angle_border(moments, density.log_prob(value), mass)
         if bool(moments.resolved.all()):
             return exact
         sampled = sampled_border(density, value, mass, samples)
-        return Border(*(torch.where(moments.resolved, a, b) for a, b in zip(exact, sampled, strict=True)))
+        return Region(*(torch.where(moments.resolved, a, b) for a, b in zip(exact, sampled, strict=True)))
     distance = mahalanobis(density, value)
     if distance is None:
         return sampled_border(density, value, mass, samples)
@@ -75,13 +64,13 @@ def border(density: Distribution, value: Tensor, mass: float, samples: int) -> B
     inside = torch.special.gammainc(torch.full_like(distance, density.event_shape[0] / 2), distance / 2)
     known = normals(density)
     if known is None:
-        return Border(inside, inside, torch.full_like(inside, torch.nan))
+        return Region(inside, inside, torch.full_like(inside, torch.nan))
     quantile = torch.special.ndtri(torch.tensor((1 + mass) / 2, dtype=torch.float64))
-    return Border(inside, inside, 2 * quantile.to(inside) * known.scale.squeeze(-1))
+    return Region(inside, inside, 2 * quantile.to(inside) * known.scale.squeeze(-1))
 
 
-def class_border(density: Distribution, value: Int[Tensor, "batch"], mass: float) -> Border:
-    """Return `Border`, the masses of the regions up to the true class and the size of the region of mass `mass`.
+def class_border(density: Distribution, value: Int[Tensor, "batch"], mass: float) -> Region:
+    """Return `Region`, the masses of the regions up to the true class and the size of the region of mass `mass`.
 
     All are sums over the classes. The size is the number of most likely labels that hold `mass`. Of the last label
     only the part that is needed counts, so that the size is not an integer.
@@ -91,11 +80,11 @@ def class_border(density: Distribution, value: Int[Tensor, "batch"], mass: float
     equal = EQUAL[torch.float32]
     low = _sum_where(probability > at * (1 + equal), probability)
     high = _sum_where(probability >= at * (1 - equal), probability)
-    return Border(low, high, _count_cells(probability, mass))
+    return Region(low, high, _count_cells(probability, mass))
 
 
-def angle_border(moments: CircularMoments, log_prob: Float[Tensor, "batch"], mass: float) -> Border:
-    """Return `Border` for one angle: the masses of the regions up to the target and the size of the region of `mass`.
+def angle_border(moments: CircularMoments, log_prob: Float[Tensor, "batch"], mass: float) -> Region:
+    """Return `Region` for one angle: the masses of the regions up to the target and the size of the region of `mass`.
 
     They are computed by cubic interpolation of the density and its derivative on a fine grid.
 
@@ -112,10 +101,10 @@ def angle_border(moments: CircularMoments, log_prob: Float[Tensor, "batch"], mas
         _angle_border_of_part(CircularMoments(moment_part, known), at, mass)
         for moment_part, known, at in parts
     ]
-    return Border(*(torch.cat(numbers) for numbers in zip(*borders, strict=True)))
+    return Region(*(torch.cat(numbers) for numbers in zip(*borders, strict=True)))
 
 
-def _angle_border_of_part(moments: CircularMoments, log_prob: Float[Tensor, "batch"], mass: float) -> Border:
+def _angle_border_of_part(moments: CircularMoments, log_prob: Float[Tensor, "batch"], mass: float) -> Region:
     cubic = Cubic.of(moments)
     level, equal = log_prob.double().exp(), EQUAL[log_prob.dtype]
     low, _ = cubic.above(level)
@@ -129,7 +118,7 @@ def _angle_border_of_part(moments: CircularMoments, log_prob: Float[Tensor, "bat
         )
     missing = log_prob.isnan() | moments.moments[0].isnan()
     border = (low.clamp(0, 1), high.clamp(0, 1), cubic.size(mass))
-    return Border(*(torch.where(missing, torch.nan, number) for number in border))
+    return Region(*(torch.where(missing, torch.nan, number) for number in border))
 
 
 class Cubic(NamedTuple):
@@ -256,8 +245,8 @@ def _root(function: Callable[[Tensor], Tensor], low: Tensor, high: Tensor) -> Te
     return (low + high) / 2
 
 
-def sampled_border(density: Distribution, value: Tensor, mass: float, samples: int) -> Border:
-    """Return `Border`, estimated from samples of the density.
+def sampled_border(density: Distribution, value: Tensor, mass: float, samples: int) -> Region:
+    """Return `Region`, estimated from samples of the density.
 
     The masses follow from the rank of the target's density among the densities of the samples. For one number, the size
     of the region {x: p(x) ≥ t} is estimated as E[1{p(X) ≥ t} / p(X)], where the level t is the quantile of the sampled
@@ -273,7 +262,7 @@ def sampled_border(density: Distribution, value: Tensor, mass: float, samples: i
         inside_count = max(1, round(mass * samples))
         size = (-log_prob.sort(0, descending=True).values[:inside_count]).exp().sum(0) / samples
     missing = log_prob.isnan().any(0) | at.isnan()
-    return Border(*(torch.where(missing, torch.nan, number) for number in (low, high, size)))
+    return Region(*(torch.where(missing, torch.nan, number) for number in (low, high, size)))
 
 
 def _sum_where(chosen: Tensor, probability: Tensor) -> Tensor:

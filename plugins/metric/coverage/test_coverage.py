@@ -115,6 +115,15 @@ def test_the_region_of_one_angle_is_the_arc_around_the_mean(concentration, dtype
     np.testing.assert_allclose(actual.size.numpy(), 2 * width, rtol=1e-5 if single else 1e-6)
 
 
+def test_closed_forms_of_one_angle_agree_with_the_grid():
+    raw = torch.randn(50, 3, dtype=WIDE)
+    value = torch.randn(50, 1, dtype=WIDE)
+    density = head("von_mises", ANGLE)(raw)
+    twice = Mixture(torch.zeros(50, 2, dtype=WIDE), head("von_mises", ANGLE)(raw[:, None].expand(50, 2, 3)))
+    for closed, on_grid in zip(border(density, value, 0.9, 10), border(twice, value, 0.9, 10), strict=True):
+        torch.testing.assert_close(closed, on_grid, rtol=1e-6, atol=1e-7)
+
+
 def test_all_targets_are_equally_dense_for_the_uniform_angle():
     actual = border(
         head("von_mises", ANGLE)(torch.zeros(3, 3, dtype=WIDE)), torch.randn(3, 1).double(), 0.9, 10
