@@ -232,7 +232,7 @@ while not (here / "kill").exists():
     time.sleep(0.05)
 cluster.remove_node(node, allow_graceful=False)
 (here / "killed").touch()
-while not (here / "release").exists():
+while not (here / "end").exists():
     time.sleep(0.05)
 cluster.shutdown()
 """
@@ -254,13 +254,13 @@ def test_a_job_is_done_again_when_the_node_of_its_ray_task_dies(ray_app: App) ->
         )
         ray_app.until_ready(0, 1)
         (ray_app.folder / "kill").touch()
-        wait_for(lambda: "NodeDiedError" in ray_app.said(), 60)
+        wait_for(lambda: "ended by Ray" in ray_app.said(), 60)
         (ray_app.folder / "release").touch()
         assert process.wait(timeout=100) == 0, ray_app.said()
         assert sorted(ray_app.tries(job) for job in range(2)) == [1, 2]
     finally:
         (ray_app.folder / "kill").touch()
-        (ray_app.folder / "release").touch()
+        (ray_app.folder / "end").touch()
         cluster.wait(timeout=60)
 
 

@@ -79,6 +79,7 @@ class NodeJob:
         self._code: int | None = None
         self._seconds: float | None = None
         self._stopped = False
+        self._orphaned = False
 
     def __call__(self) -> None:
         """Run the command and write node.json, unless the job's record names another process."""
@@ -117,6 +118,8 @@ class NodeJob:
         _write(folder, state)
         try:
             state["code"] = self._run(CONSOLE, lock)
+            if self._orphaned and self._code != 0:  # SLURM itself says what becomes of the job
+                state |= {"code": None} if self.handle is None else {"reason": "the daemon of its node died"}
         except Exception as error:  # SLURM does not queue the job again at its time limit
             if self._code is None:
                 raise
@@ -172,7 +175,8 @@ class NodeJob:
             try:
                 while not self._has_ended():
                     time.sleep(PATIENCE)
-                    if os.getppid() != started_by:  # the node's daemon has died
+                    if os.getppid() != started_by:
+                        self._orphaned = True
                         self._stop()
                 break
             except KeyboardInterrupt:  # how Ray cancels a task

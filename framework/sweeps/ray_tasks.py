@@ -135,17 +135,17 @@ class RayProcess:
             except self._ray.exceptions.RayError as raised:
                 error = raised
             state = read_node(self._folder, str(self.handle))
-            if state is not None and state["code"] is not None:
-                self._code, self.seconds = state["code"], state["seconds"]
-                if state["code"] < 0:
-                    name = signal.Signals(-state["code"]).name
-                    self.reason = f"killed by {name} on {shorten(state['host'])}"
-            else:
-                exceptions = self._ray.exceptions
-                self.lost = isinstance(error, exceptions.NodeDiedError)
+            self.lost = isinstance(error, self._ray.exceptions.NodeDiedError)
+            if state is None or state["code"] is None:
                 words = str(error).strip().splitlines() or [""]
-                self.reason = f"ended by Ray: {type(error).__name__}: {shorten(words[0])}"
                 self._code = -signal.SIGKILL
+                self.reason = f"ended by Ray: {type(error).__name__}: {shorten(words[0])}"
+                return self._code
+            self._code, self.seconds = state["code"], state["seconds"]
+            if state["reason"] is not None:  # the process of Ray outlived the daemon of its node for a moment
+                self.lost, self.reason = True, f"ended by Ray: {shorten(state['reason'])}"
+            elif state["code"] < 0:
+                self.reason = f"killed by {signal.Signals(-state['code']).name} on {shorten(state['host'])}"
         return self._code
 
     def send(self, number: int) -> None:
