@@ -28,6 +28,7 @@ from framework.distributions.exported import exported
 from framework.distributions.intervals import central_interval
 from framework.distributions.numpy_densities import Density
 from framework.distributions.protocol import median, value_set
+from framework.encoder import Encoder
 from framework.errors import ConfigError
 from framework.model import Model, Predictor
 from framework.target import Target
@@ -203,11 +204,26 @@ def arrays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exporting, "reader", lambda description: Arrays(description.input_shape))
 
 
+class Drawing(Encoder):
+    """A linear layer from six numbers to an image of raw parameters."""
+
+    bibtex = ""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        super().__init__()
+        self.layer = torch.nn.Linear(6, math.prod(shape))
+        self.output_shape = shape
+
+    def forward(self, inputs: torch.Tensor) -> torch.Tensor:
+        """Return the image, (batch, *shape)."""
+        return self.layer(inputs).reshape(-1, *self.output_shape)
+
+
 def model_of(name: str, row: HeadRow) -> tuple[Predictor, tuple[int, ...]]:
     """Return a small network with a head, and the shape of its inputs."""
     head = build_head(name, row)
     if head.direct:
-        return Model([], head, head.raw_shape).eval(), head.raw_shape
+        return Model([Drawing(head.raw_shape)], head).eval(), (6,)
     encoder = build("encoder", resolve("encoder", {"name": "mlp", "widths": [16]}), input_shape=(6,))
     return Model([encoder], head).eval(), (6,)
 

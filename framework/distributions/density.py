@@ -217,7 +217,12 @@ def _log_shares(logits: Tensor) -> Tensor:
 
     torch's own function takes four times as long for many rows of few numbers, and is faster for few rows.
     """
-    if logits.shape[-1] > SHORT or logits.numel() < MANY or logits.device.type != "cpu":
+    if (
+        torch.compiler.is_exporting()  # first, because an exported program must not depend on the size of a batch
+        or logits.shape[-1] > SHORT
+        or logits.numel() < MANY
+        or logits.device.type != "cpu"
+    ):
         return torch.log_softmax(logits, -1)
     shifted = logits - logits.detach().amax(-1, keepdim=True)
     return shifted - shifted.exp().sum(-1, keepdim=True).log()

@@ -22,8 +22,9 @@ def applies(count: int, *arguments: Tensor) -> bool:
     transforms of torch.func have no data that it could read.
     """
     return (
-        count >= FEWEST
-        and not torch.compiler.is_compiling()
+        not torch.compiler.is_compiling()  # first, because an exported program must not depend on the size of a batch
+        and not torch.compiler.is_exporting()
+        and count >= FEWEST
         and not torch.jit.is_tracing()
         and not is_transformed()
         and all(type(argument) in (Tensor, torch.nn.Parameter) for argument in arguments)
