@@ -67,6 +67,10 @@ def test_a_command_that_fails_is_an_error_and_handlers_are_as_before() -> None:
     assert [signal.getsignal(number) for number in NUMBERS] == before
 
 
+TIMED = {"main_job.py", "predict.py", "step_overhead.py"}
+"""Scripts that time single commands, in temporary folders, of which nothing is left if they are stopped."""
+
+
 def test_every_benchmark_that_runs_the_framework_does_it_so() -> None:
     """A sweep that is started in another way would continue alone, or be killed while it writes."""
     others = [
@@ -75,7 +79,7 @@ def test_every_benchmark_that_runs_the_framework_does_it_so() -> None:
         for path in Path(ROOT, folder).rglob("*.py")
         if '"-m", "framework"' in (text := path.read_text(encoding="utf-8")) and "subprocess.run(" in text
     ]
-    assert others == []
+    assert set(others) <= TIMED
 
 
 @pytest.mark.parametrize("package", ["benchmarks", "reproduction"])

@@ -145,7 +145,8 @@ def test_only_models_that_are_alike_are_joined(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="differ in encoder"):
         common_description([described(), described(encoder=[{"name": "mlp"}])])
     with pytest.raises(
-        CheckpointError, match=r"differ in data\.seed, .* Train the members .* with data\.seed=0 in all"
+        CheckpointError,
+        match=r"differ in data\.seed, .* Train all members .* add data\.seed=0 to the command",
     ):
         common_description([described(), described(data={"name": "d", "seed": 1})])
     with pytest.raises(CheckpointError, match="differ in input_shape"):

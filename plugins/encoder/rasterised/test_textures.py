@@ -217,9 +217,9 @@ WRONG = {
         change_arrays(faces=lambda faces: faces[:1], uv_faces=lambda faces: faces[:1]),
         "the 1 faces in",
     ),
-    "no such place": (change_arrays(uv_faces=lambda faces: faces + 1), "does not fit"),
+    "no such place": (change_arrays(uv_faces=lambda faces: faces + 1), "rows of uv in uv_faces"),
     "in space": (change_arrays(uv=lambda uv: np.pad(uv, ((0, 0), (0, 1)))), "topology_7k.npz"),
-    "nowhere": (change_arrays(uv=lambda uv: uv * np.nan), "does not fit"),
+    "nowhere": (change_arrays(uv=lambda uv: uv * np.nan), "finite uv (coordinates, 2)"),
     "colours of another": (write_equal_colors, "have the same vertex colours"),
     "gone": (remove_folder, "no such folder"),
 }
