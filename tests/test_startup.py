@@ -49,7 +49,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "data=point_cloud_folder encoder=[occupancy] mode.files=clouds mode.into=features",
         "numba scipy.linalg",
     ),
-    "work_precision": ("checkpoint=train mode.values=[1,2] mode.repeats=2", "torchmetrics matplotlib"),
+    "work_precision": (
+        "checkpoint=train mode.values=[1,2] mode.repeats=2",
+        "torchmetrics matplotlib numba scipy.linalg",  # its reference takes so many samples that they are compiled
+    ),
     "check": ("metric=[accuracy]", "torchmetrics"),
     "plugins": ("", ""),
     "sync": ("mode.run=train", ""),

@@ -5,7 +5,12 @@ import torch
 from torch import Tensor
 
 FEWEST = 4096
-"""Smallest number of elements that are computed by compiled code; its start takes longer than fewer elements."""
+"""Smallest number of elements that are computed by compiled code if gradients are needed, as in each training step."""
+FEWEST_ONCE = 2**18
+"""Smallest number of elements that are computed by compiled code without gradients, and of samples.
+
+The import of numba takes half a second, which few evaluations of fewer elements would not make up for.
+"""
 
 CPU = torch.device("cpu")
 
@@ -15,16 +20,14 @@ def is_transformed() -> bool:
     return torch._C._functorch.peek_interpreter_stack() is not None  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def applies(count: int, *arguments: Tensor) -> bool:
-    """Return whether compiled code computes `count` elements from these arguments.
+def applies(*arguments: Tensor) -> bool:
+    """Return whether compiled code can read these arguments: ordinary tensors on the CPU.
 
-    It does for at least FEWEST elements of ordinary tensors on the CPU. Tensors in compiled or exported programs and in
-    transforms of torch.func have no data that it could read.
+    Tensors in compiled or exported programs and in transforms of torch.func have no data that it could read.
     """
     return (
-        not torch.compiler.is_compiling()  # first, because an exported program must not depend on the size of a batch
+        not torch.compiler.is_compiling()
         and not torch.compiler.is_exporting()
-        and count >= FEWEST
         and not torch.jit.is_tracing()
         and not is_transformed()
         and all(type(argument) in (Tensor, torch.nn.Parameter) for argument in arguments)
@@ -45,7 +48,7 @@ def empty(count: int, shape: torch.Size, dtype: torch.dtype) -> list[Tensor]:
 def multiply(factor: Tensor, *tensors: Tensor) -> list[Tensor]:
     """Return the product of `factor` and each of the tensors, which have its shape and dtype."""
     # with gradients enabled, they are recorded for second derivatives
-    if torch.is_grad_enabled() or not applies(factor.numel(), factor, *tensors):
+    if torch.is_grad_enabled() or not applies(factor, *tensors) or factor.numel() < FEWEST:
         return [factor * tensor for tensor in tensors]
     products = empty(len(tensors), factor.shape, factor.dtype)
     return [torch.mul(factor, tensor, out=product) for tensor, product in zip(tensors, products, strict=True)]
@@ -54,14 +57,17 @@ def multiply(factor: Tensor, *tensors: Tensor) -> list[Tensor]:
 def density(value: Tensor, mean: Tensor, concentration: Tensor, *, slopes: bool) -> tuple[Tensor, ...] | None:
     """Return log p, and with `slopes` also its derivatives by the mean and by κ, without gradients.
 
-    The arguments are broadcast and have one dtype. If compiled code does not apply, or a difference of angles is beyond
-    its reach, the function returns None.
+    The arguments are broadcast and have one dtype. If compiled code does not apply, if there are too few elements, or
+    if a difference of angles is beyond its reach, the function returns None.
     """
+    # first, because an exported program must not depend on the size of a batch
+    if not applies(value, mean, concentration) or value.dtype not in (torch.float32, torch.float64):
+        return None
     shape = value.shape
     if mean.shape != shape or concentration.shape != shape:
-        shape = torch.broadcast_shapes(shape, mean.shape, concentration.shape)
-    known = value.dtype in (torch.float32, torch.float64)
-    if not known or not applies(shape.numel(), value, mean, concentration):
+        # torch.broadcast_shapes would import SymPy
+        shape = torch.broadcast_tensors(value, mean, concentration)[0].shape
+    if shape.numel() < (FEWEST if slopes else FEWEST_ONCE):
         return None
     from plugins.density_head.von_mises import compiled
 
@@ -79,7 +85,7 @@ def sample(mean: Tensor, concentration: Tensor, block: int, rounds: int) -> Tens
     Both arguments have the same shape. Random numbers are drawn in the same order as by torch operations, so that
     samples agree up to rounding.
     """
-    if not applies(mean.numel(), mean, concentration):
+    if not applies(mean, concentration) or mean.numel() < FEWEST_ONCE:
         return None
     from plugins.density_head.von_mises import compiled
 

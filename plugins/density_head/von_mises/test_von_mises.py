@@ -96,6 +96,7 @@ def way(fewest):
     """Compute tensors of at least `fewest` elements by compiled code (numba), and others by torch operations."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(processor, "FEWEST", fewest)
+        patch.setattr(processor, "FEWEST_ONCE", fewest)
         yield
 
 
@@ -641,6 +642,7 @@ def test_angles_of_any_size_are_read_as_the_docstring_says(dtype, fewest, monkey
     float32 angles are read exactly; float64 angles beyond 4e8 radians have an error of one unit of their last digit.
     """
     monkeypatch.setattr(processor, "FEWEST", fewest)
+    monkeypatch.setattr(processor, "FEWEST_ONCE", fewest)
     value = torch.logspace(6, 38, 129, dtype=torch.float64).to(dtype)
     value = torch.cat([value, -value])
     mean, kappa = torch.full_like(value, 0.7), torch.full_like(value, 2.0)
