@@ -23,14 +23,19 @@ from scipy import special, stats
 from torch import Tensor
 
 from benchmarks.pages import machine, replace_section, write_page
-from benchmarks.timing import ROUNDS, median_and_range, require_idle, time_interleaved
+from benchmarks.timing import ROUNDS, Rounds, first_calls, median_and_range, require_idle, time_interleaved
 from framework.distributions.circular import circular_median, wrap
 from framework.distributions.density import Mixture
+from framework.prediction import Prediction
+from framework.target import Target
 from plugins.density_head.von_mises import functions, integrals
 from plugins.density_head.von_mises.density import VonMises
 from plugins.density_head.von_mises.fit_coefficients import bessel
+from plugins.density_head.von_mises.processor import FEWEST, FEWEST_ONCE
+from plugins.metric.coverage.metric import Coverage
 
 COUNT = 10**6
+COUNTS = (1, 64, 1000, COUNT)
 DTYPES = (torch.float32, torch.float64)
 GROUPS = (
     (0, 1e-30, 1e-8, 1e-4, 1e-2),
@@ -48,13 +53,23 @@ SAMPLED = (0, 1e-3, 1, 100, 1e6, 1e12, 1e30)
 KERNELS = tempfile.TemporaryDirectory()
 os.environ["TORCHINDUCTOR_CACHE_DIR"] = KERNELS.name
 COMPILED = torch.compile(functions.log_prob, dynamic=False, fullgraph=True)
-ONE_PASS = torch.compile(functions.log_prob_and_slopes, dynamic=False, fullgraph=True)
 Density = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 def torch_log_prob(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
     """Return the log-density by `torch.distributions`."""
     return torch.distributions.VonMises(mean, concentration, validate_args=False).log_prob(value)
+
+
+def log_prob(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
+    """Return the log-density by the class `VonMises`."""
+    return VonMises(mean[:, None], concentration[:, None]).log_prob(value[:, None])
+
+
+def log_prob_of_many(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
+    """Return the log-density by the class `VonMises`, of so many elements that compiled code computes them."""
+    repeats = -(-FEWEST // len(value))
+    return log_prob(*(tensor.repeat(repeats) for tensor in (value, mean, concentration)))[: len(value)]
 
 
 def largest_errors(density: Density, dtype: torch.dtype) -> list[list[float]]:
@@ -89,11 +104,11 @@ def largest_errors(density: Density, dtype: torch.dtype) -> list[list[float]]:
 def accuracy_table() -> list[str]:
     """Return the lines of the table of errors."""
     lines = [
-        "| dtype | range of κ | execution | log p | d/dκ | d/dμ | entropy |",
+        "| dtype | range of κ | elements | log p | d/dκ | d/dμ | entropy |",
         "|---|---|---|---|---|---|---|",
     ]
     for dtype in DTYPES:
-        for name, density in (("eager", functions.log_prob), ("compiled", COMPILED)):
+        for name, density in (("few", log_prob), ("many", log_prob_of_many), ("torch.compile", COMPILED)):
             for group, worst in zip(GROUPS, largest_errors(density, dtype), strict=True):
                 cells = " | ".join(f"{number:.1f}" for number in worst)
                 lines.append(f"| {str(dtype)[6:]} | {group[0]:g} to {group[-1]:g} | {name} | {cells} |")
@@ -106,43 +121,35 @@ def compute_gradients(density: Density, arguments: tuple[Tensor, ...], ones: Ten
 
 
 @torch.no_grad()
-def compute_value(density: Density, arguments: tuple[Tensor, ...]) -> None:
+def compute_value(density: Density, arguments: tuple[Tensor, ...], ones: Tensor) -> None:
     """Compute log p without a gradient."""
     density(*arguments)
 
 
 def speed_table() -> list[str]:
-    """Return the lines of the table of times of log p and its gradients, for torch's functions and ours."""
+    """Return the lines of the table of times of log p and its gradients, for torch's class and ours."""
     lines = [
-        "| dtype | implementation | log p, ms | speed-up over torch | log p and gradients, ms | speed-up over torch |",
-        "|---|---|---|---|---|---|",
+        "| dtype | elements | class | log p | speed-up over torch | log p and gradients | speed-up over torch |",
+        "|---|---|---|---|---|---|---|",
     ]
-    densities = {"torch": torch_log_prob, "ours, eager": functions.log_prob, "ours, compiled": COMPILED}
+    densities = {"torch": torch_log_prob, "ours": log_prob}
     for dtype in DTYPES:
-        value, mean, logarithm = torch.randn(3, COUNT, dtype=dtype)
-        arguments = (value, mean.requires_grad_(), torch.exp(2 * logarithm + 1).requires_grad_())
-        detached = tuple(argument.detach() for argument in arguments)
-        ones = torch.ones(COUNT, dtype=dtype)
-        values = time_interleaved(
-            {name: partial(compute_value, density, arguments) for name, density in densities.items()}
-        )
-        one_pass = {"ours, compiled, `log_prob_and_slopes`": partial(ONE_PASS, *detached)}
-        gradients = time_interleaved(
-            {
-                name: partial(compute_gradients, density, arguments, ones)
-                for name, density in densities.items()
-            }
-            | one_pass
-        )
-        for name, rounds in gradients.items():
-            cells = [str(dtype)[6:], name]
-            cells += (
-                [values[name].text(), values[name].times_faster(values["torch"])]
-                if name in values
-                else ["–", "–"]
+        for count in COUNTS:
+            value, mean, logarithm = torch.randn(3, count, dtype=dtype)
+            arguments = (value, mean.requires_grad_(), torch.exp(2 * logarithm + 1).requires_grad_())
+            ones = torch.ones(count, dtype=dtype)
+            values, gradients = (
+                time_interleaved(
+                    {name: partial(compute, density, arguments, ones) for name, density in densities.items()},
+                    seconds=0.2,
+                )
+                for compute in (compute_value, compute_gradients)
             )
-            cells += [rounds.text(), rounds.times_faster(gradients["torch"])]
-            lines.append(f"| {' | '.join(cells)} |")
+            for name in densities:
+                cells = [str(dtype)[6:], f"{count:,}", name]
+                for rounds in (values, gradients):
+                    cells += [f"{rounds[name].text()} ms", rounds[name].times_faster(rounds["torch"])]
+                lines.append(f"| {' | '.join(cells)} |")
     return lines
 
 
@@ -158,13 +165,14 @@ def sampling_table() -> list[str]:
         cells = []
         for dtype in DTYPES:
             zero, concentration = torch.zeros(COUNT, dtype=dtype), torch.full((COUNT,), kappa, dtype=dtype)
-            samples = functions.sample(zero, concentration).double()
+            density = VonMises(zero[:, None], concentration[:, None])
+            samples = density.sample()[:, 0].double()
             exact = concentration[:1].double()
             result = stats.kstest(
                 samples.numpy(), lambda at, k=exact: integrals.cdf(torch.from_numpy(at), k * 0, k).numpy()
             )
             cells.append(f"{result.statistic:.1e} | {result.pvalue:.2f}")
-        samplers: dict[str, Callable[[], object]] = {"ours": partial(functions.sample, zero, concentration)}
+        samplers: dict[str, Callable[[], object]] = {"ours": density.sample}
         # torch's sampler does not terminate for κ = 0 and from 1e16 on, and is wrong for smaller κ above 1e6
         if 0 < kappa <= 1e6:
             samplers["torch"] = torch.distributions.VonMises(zero, concentration, validate_args=False).sample
@@ -270,6 +278,41 @@ def mixture_table() -> list[str]:
     return lines
 
 
+def time_coverage() -> list[str]:
+    """Return the text on the time of the metric `coverage` for von Mises densities."""
+    target = Target("angle", ("azimuth",))
+    texts = []
+    for rows in (64, 1000):
+        density = VonMises(torch.randn(rows, 1), torch.exp(2 * torch.randn(rows, 1) + 1))
+        prediction = Prediction(density, {"target": torch.randn(rows, 1)})
+        metric = Coverage(target)
+        times = time_interleaved({"coverage": partial(metric.update, prediction)}, seconds=0.2)["coverage"]
+        texts.append(
+            f"{Rounds(tuple(number / rows for number in times.milliseconds)).text()} ms for {rows:,} rows"
+        )
+    return [
+        "The metric `coverage` takes, for each row of a batch of von Mises densities of one angle, "
+        f"{' and '.join(texts)} in float32."
+    ]
+
+
+def time_first_calls() -> list[str]:
+    """Return the text on the time of the first call of compiled code, without and with a cache."""
+    script = (
+        "import time, torch\nfrom plugins.density_head.von_mises.density import VonMises\n"
+        "tensors = [torch.rand(10_000, 1, requires_grad=True) for _ in range(3)]\n"
+        "VonMises(*(tensor[:100] for tensor in tensors[1:])).log_prob(tensors[0][:100]).sum().backward()\n"
+        "start = time.perf_counter()\nVonMises(*tensors[1:]).log_prob(tensors[0]).sum().backward()\n"
+        "print(time.perf_counter() - start)"
+    )
+    cold, warm = first_calls(script, NUMBA_CACHE_DIR="{}")
+    return [
+        f"The first log-density and gradient of 10,000 elements in a process takes {cold:.2g} s without a cache of "
+        f"compiled code and {warm:.2g} s with one; most of the latter is the import of numba. Processes that only "
+        f"compute fewer than {FEWEST:,} elements at once, or {FEWEST_ONCE:,} without gradients, do not import it."
+    ]
+
+
 def time_medians() -> list[str]:
     """Return the text on the time of the circular median of 64 × 10,000 samples, and of two of them by all pairs."""
     samples = wrap(torch.randn(10_000, 64))
@@ -295,16 +338,17 @@ def time_medians() -> list[str]:
 SPEEDS = {
     "## Speed": (
         speed_table,
-        f"The functions were evaluated for {COUNT:,} elements. `torch` is torch.distributions.VonMises. The gradients "
-        "are those in μ and κ. `log_prob_and_slopes` computes log p and its gradients in one pass, so that it has no "
-        "time for log p alone.",
+        "The log-density of independent angles was computed by the class `VonMises` of the project (ours) and by "
+        "torch.distributions.VonMises (torch), each constructed in every call. The gradients are those in μ and κ.",
     ),
+    "## First call": (time_first_calls, ""),
     "## Sampling": (
         sampling_table,
         f"For each κ, {COUNT:,} samples were compared with the distribution function by a Kolmogorov-Smirnov (KS) "
         "test. A distance above 1.4e-3 is significant at the level of 5 %, and p is the p-value. The times are those "
         "in float64. A dash means that the sampler of torch does not terminate, or is wrong, at this κ.",
     ),
+    "## Coverage": (time_coverage, ""),
     "## Point prediction": (time_medians, ""),
 }
 """Sections with times: the heading, the function that returns the lines, and the text before the lines."""
@@ -339,8 +383,8 @@ def report() -> str:
             "",
             "The table gives the largest errors of the log-density log p, of its derivatives in κ and μ, and of the "
             "entropy, in machine epsilons of the dtype. The references have 60 digits. The mean μ is 3 rad, and the "
-            "angle φ differs from it by 0 to ±1e6 rad. `eager` is the usual execution by torch, and `compiled` the "
-            "code of torch.compile.",
+            "angle φ differs from it by 0 to ±1e6 rad. Few elements are computed by torch operations, and "
+            f"{FEWEST:,} or more (many) by compiled code; `torch.compile` is the code that torch compiles.",
             "",
             "The errors of log p and of the entropy are relative to max(1, |reference|). The error of d/dμ is relative "
             "to the reference. The error of d/dκ is relative to |cos(φ-μ) - 1| + 1 - A(κ), because d/dκ is a "
