@@ -149,7 +149,7 @@ def test_humps_of_nested_mixtures_are_highest_together(structure: str) -> None:
 def test_the_mode_of_very_many_components_is_as_high_as_their_modes(
     kind: str, widths: tuple[float, float]
 ) -> None:
-    """With so many components the density at their modes is interpolated, over widths that are equal or not."""
+    """The density at the modes of so many components is interpolated, whether their widths are equal or not."""
     generator = torch.Generator().manual_seed(5)
     weights, place, part = torch.rand(3, 2, FEWEST, dtype=torch.float64, generator=generator)
     low, high = (math.log(width) for width in widths)
