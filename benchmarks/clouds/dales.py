@@ -36,10 +36,10 @@ def main() -> None:
         f"into {len(rows)} folds, and each fold is the test split of one run. **The mean accuracy over the folds is "
         f"{accuracy.mean():.4f}** (standard deviation over folds {accuracy.std(ddof=1):.4f}). The text at the top "
         "of `dales.py` lists the commands that train the models.\n\n"
-        "Each row of the table is the result for one test split (fold). Accuracy is the share of objects that are "
-        "classified correctly. NLL is the mean negative log-likelihood of "
-        "the true class; lower is better. ECE is the expected calibration error; 0 is best. ± is the standard error "
-        "over the test objects of a fold.\n\n"
+        "Each row of the table is the result of BPS-MLP on one test split (fold) of DALES. Accuracy is the share of "
+        "objects that are classified correctly. NLL is the mean negative log-likelihood of the true class; lower is "
+        "better. ECE is the expected calibration error; 0 is best. ± is the standard error over the test objects of "
+        "a fold.\n\n"
         f"{markdown(rows, COLUMNS)}\n\n{machine('torch', 'pytorch-lightning')}\n"
     )
     publish(__file__, text)

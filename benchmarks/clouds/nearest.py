@@ -294,40 +294,42 @@ def report() -> str:
             "compares the run time of the project's exact search (`ours`) with five exact searches of public "
             "libraries. It is written by `python -m benchmarks.clouds.nearest`.",
             "",
-            f"Each cloud has n points in float32. The shapes are {', '.join(samplers())}. The clouds of `scan` are "
-            "points of a real scan, resampled with jitter; the other shapes are synthetic. The k basis points are "
-            "uniform in the unit ball. A measured call builds the search structure of a cloud and computes the k "
-            "distances and the k difference vectors.",
+            "The methods search the nearest points in clouds of n points in float32. The shapes of the clouds are "
+            f"{', '.join(samplers())}. The clouds of `scan` are points of a real scan, resampled with jitter; the "
+            "other shapes are synthetic. The k basis points are uniform in the unit ball. A measured call builds the "
+            "search structure of a cloud and computes the k distances and the k difference vectors.",
             "",
-            "The table gives the processor time in milliseconds per cloud. Each number is the shortest time of "
-            "several rounds; every round calls all methods one after the other. `ours` gets all clouds in one call. "
-            f"`{ONE_PER_CALL}` and the libraries get one "
-            "cloud per call. `ball_tree` and `sklearn_kd` are the two trees of scikit-learn, and `scipy_kd` is the "
-            "tree of SciPy. The last two columns give the speed-up of `ours` over a library: the time of the "
+            "The table gives the processor time, in milliseconds per cloud, to find the nearest point of the cloud "
+            "to each basis point on one core. Each number is the shortest time of several rounds; every round calls "
+            f"all methods one after the other. `ours` gets all clouds in one call. `{ONE_PER_CALL}` and the libraries "
+            "get one cloud per call. `ball_tree` and `sklearn_kd` are the two trees of scikit-learn, and `scipy_kd` "
+            "is the tree of SciPy. The last two columns give the speed-up of `ours` over a library: the time of the "
             "library divided by the time of `ours`. The first number in brackets is the speed-up of "
             f"`{ONE_PER_CALL}`, and the second is the speed-up that this project requires.",
             "",
             *lines,
             "",
-            "The distances of each method were compared with SciPy in float64. The largest absolute differences, for "
-            "clouds in the unit ball, are: "
+            "The distance from each basis point to its nearest point was compared between each method and SciPy in "
+            "float64. The largest absolute differences, for clouds in the unit ball, are: "
             + ", ".join(f"`{name}` {error:.0e}" for name, error in errors.items())
             + ".",
             "",
             "## Clouds that are difficult for grids and trees",
             "",
-            "These clouds have 100,000 points, and there are 1,000 basis points. For each method, the table gives "
-            "the shortest processor time of four calls. It also gives the largest absolute difference between a "
-            "distance of `ours` and the distance that SciPy computes in float64.",
+            "The table compares the search of this project (`ours`) with the library pykdtree on clouds that are "
+            "difficult for search structures. Each cloud has 100,000 points, and there are 1,000 basis points. The "
+            "time is the shortest processor time of four calls. The table also gives the largest absolute difference "
+            "between a distance of `ours` and the distance that SciPy computes in float64.",
             "",
             hard,
             "",
             "## Two threads",
             "",
-            "This table gives the speed-up of two threads over one; at least 1.8 is required. The speed-up by "
-            "processor time is 2 t₁ / t₂, where t₁ and t₂ are the least processor times with one and with two threads. "
-            "The speed-up by wall time is meaningful only if no other process uses the two cores. The load average of "
-            f"the machine was {load:.1f}; this benchmark alone causes a load of about 1.5.",
+            "This table gives the speed-up of the project's search for nearest points with two threads over one "
+            "thread; the project requires at least 1.8. The speed-up by processor time is 2 t₁ / t₂, where t₁ and t₂ "
+            "are the least processor times with one and with two threads. The speed-up by wall time is meaningful "
+            f"only if no other process uses the two cores. The load average of the machine was {load:.1f}; this "
+            "benchmark alone causes a load of about 1.5.",
             "",
             "| clouds | points | basis points | speed-up by wall time | speed-up by processor time |",
             "|---:|---:|---:|---:|---:|",
@@ -338,9 +340,9 @@ def report() -> str:
             "",
             "## First call",
             "",
-            "The first call in a process also compiles the search, once for float32 and once for float64. It takes "
-            f"{cold:.1f} s of processor time if everything is compiled, and {warm:.2f} s if the machine code is read "
-            "from the cache.",
+            "The first search for nearest points in a process also compiles the code of the search, once for float32 "
+            f"and once for float64. This first call takes {cold:.1f} s of processor time if everything is compiled, "
+            f"and {warm:.2f} s if the machine code is read from the cache.",
             "",
             machine("numba", "torch", "scipy", "scikit-learn", "pykdtree", "pynanoflann"),
             "",
@@ -389,13 +391,14 @@ def streaming(total: int = 10**8, size: int = 10**6, basis_points: int = 1000) -
         "computes the mean of the points. The second pass computes the largest distance of a point from the mean, "
         f"which is called the largest norm. The third pass finds, for each of {basis_points:,} basis points, the "
         "nearest point of the cloud.\n\n"
-        f"The first pass takes {seconds['mean']:.1f} s of processor time, the second {seconds['largest norm']:.1f} s "
-        f"and the third {seconds['nearest']:.1f} s. These times do not include the generation of the points, which "
-        f"takes {seconds['generating']:.1f} s for the three passes together. "
-        f"The peak memory was {peak / 2**10:.0f} MiB; {base / 2**10:.0f} MiB of it "
-        "were in use before the first chunk was read (libraries and one chunk). All points together would take "
-        f"{12 * total / 2**20:.0f} MiB.\n\n"
-        "The cloud was normalised with the mean and the largest norm before the third pass. The mean of the points is "
+        "The search for the nearest points reads the cloud in three passes. The first pass takes "
+        f"{seconds['mean']:.1f} s of processor time, the second {seconds['largest norm']:.1f} s and the third "
+        f"{seconds['nearest']:.1f} s. These times do not include the generation of the points, which takes "
+        f"{seconds['generating']:.1f} s for the three passes together. The peak memory was {peak / 2**10:.0f} MiB; "
+        f"{base / 2**10:.0f} MiB of it were in use before the first chunk was read (libraries and one chunk). All "
+        f"points together would take {12 * total / 2**20:.0f} MiB.\n\n"
+        "Before the third pass, which finds the nearest point to each basis point, the cloud was normalised with the "
+        "mean of its points and the largest norm. The mean of the points is "
         f"{[round(x, 4) for x in middle.mean.tolist()]}, the largest norm is {reach.norm:.4f}, and the mean distance "
         f"from a basis point to its nearest point is {float(result.distance.mean()):.6f}.\n\n"
         f"{machine('numba', 'torch')}\n"

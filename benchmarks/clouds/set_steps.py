@@ -165,14 +165,16 @@ gradient. These networks compute the maximum of each channel over the points of 
 a maximum influence the result. The column names say whether these "attaining points" or "every point" pass the last
 layers with a gradient. The page is written by `python -m benchmarks.clouds.set_steps`.
 
-A step is the forward and the backward pass of {BATCH} clouds (synthetic CAD models) in float32 on one thread. It is
-measured after {TRAINED} steps of training. Both methods run in each of {ROUNDS} interleaved rounds. The columns are:
-
-- ms: processor time of a step, median over the rounds;
-- time ratio: time with every point divided by time with the attaining points, median over the rounds;
+A training step is the forward and the backward pass of {BATCH} clouds (synthetic CAD models) in float32 on one
+thread. The step is measured after {TRAINED} steps of training. Both methods run in each of {ROUNDS} interleaved
+rounds. The columns are:
+- ms: processor time of a training step, median over the rounds;
+- time ratio: processor time of a step in which every point has a gradient, divided by that of a step in which only
+  the points that attain a maximum have one, median over the rounds;
 - MB: memory that autograd stores until the backward pass, without the parameters, median over the rounds;
-- gradient error: largest relative error of the gradient of a parameter, over all rounds, compared with the gradient in
-  float64 through every point. Parameters whose gradient consists only of rounding errors are left out.
+- gradient error: largest relative error of the gradient with respect to a parameter of the network, over all rounds.
+  The reference is the gradient in float64 through every point. Parameters whose gradient consists only of rounding
+  errors are left out.
 
 {chr(10).join(lines)}
 

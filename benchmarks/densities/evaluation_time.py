@@ -139,8 +139,9 @@ def main() -> None:
             f"All tables give milliseconds per sample, in batches of {BATCH}, in float32 on one thread. A number is "
             "the median of seven calls, or the time of one call if a call takes more than half a second.",
             "",
-            "The densities have random raw parameters, and the targets are sampled from the densities. For the narrow "
-            "von Mises density, the raw parameters are 100 times as large as for the others.",
+            "The predicted densities on this page have random raw parameters, and the targets are sampled from the "
+            "densities. For the narrow von Mises density, the raw parameters are 100 times as large as for the "
+            "others.",
             "",
             "## Metrics",
             "",
@@ -151,16 +152,17 @@ def main() -> None:
             "",
             "## Methods of a density",
             "",
-            "Metrics and figures call these methods of a density. The last column is the marginal density of the first "
-            "number of the target, evaluated at 360 angles. A dash means that the method was not measured.",
+            "The table gives the time of methods of a density that metrics and figures call. The last column is the "
+            "marginal density of the first number of the target, evaluated at 360 angles. A dash means that the "
+            "method was not measured.",
             "",
             *table({name: partial(time_method, method=method) for name, method in METHODS.items()}),
             "",
             "## Dropout at test time",
             "",
             "The wrapper `mc_dropout` returns a mixture of the densities under S random dropout masks. The table "
-            "gives the time of one prediction. The number in brackets says how many times faster this is than S "
-            "predictions with one mask each.",
+            "gives the time of one prediction with S masks. The number in brackets says how many times faster it is "
+            "than S predictions with one mask each.",
             "",
             f"| network | {' | '.join(f'S = {samples}' for samples in SAMPLES)} |",
             f"|---|{'---:|' * len(SAMPLES)}",

@@ -307,9 +307,10 @@ def time_first_calls() -> list[str]:
     )
     cold, warm = first_calls(script, NUMBA_CACHE_DIR="{}")
     return [
-        f"The first log-density and gradient of 10,000 elements in a process takes {cold:.2g} s without a cache of "
-        f"compiled code and {warm:.2g} s with one; most of the latter is the import of numba. Processes that only "
-        f"compute fewer than {FEWEST:,} elements at once, or {FEWEST_ONCE:,} without gradients, do not import it."
+        "The first log-density and gradient of von Mises densities with 10,000 elements in a process takes "
+        f"{cold:.2g} s without a cache of compiled code and {warm:.2g} s with one; most of the latter time is the "
+        f"import of numba. Processes that only compute fewer than {FEWEST:,} elements at once, or {FEWEST_ONCE:,} "
+        "without gradients, do not import it."
     ]
 
 
@@ -339,14 +340,16 @@ SPEEDS = {
     "## Speed": (
         speed_table,
         "The log-density of independent angles was computed by the class `VonMises` of the project (ours) and by "
-        "torch.distributions.VonMises (torch), each constructed in every call. The gradients are those in μ and κ.",
+        "torch.distributions.VonMises (torch), each constructed in every call. The gradients are those with respect "
+        "to the mean μ and the concentration κ.",
     ),
     "## First call": (time_first_calls, ""),
     "## Sampling": (
         sampling_table,
-        f"For each κ, {COUNT:,} samples were compared with the distribution function by a Kolmogorov-Smirnov (KS) "
-        "test. A distance above 1.4e-3 is significant at the level of 5 %, and p is the p-value. The times are those "
-        "in float64. A dash means that the sampler of torch does not terminate, or is wrong, at this κ.",
+        f"For each concentration κ, {COUNT:,} samples from a von Mises density were compared with the distribution "
+        "function by a Kolmogorov-Smirnov (KS) test. A distance above 1.4e-3 is significant at the level of 5 %, and "
+        "p is the p-value. The times to draw the samples are those in float64. A dash means that the sampler of "
+        "torch does not terminate, or is wrong, at this κ.",
     ),
     "## Coverage": (time_coverage, ""),
     "## Point prediction": (time_medians, ""),
@@ -381,27 +384,30 @@ def report() -> str:
             "",
             "## Accuracy",
             "",
-            "The table gives the largest errors of the log-density log p, of its derivatives in κ and μ, and of the "
-            "entropy, in machine epsilons of the dtype. The references have 60 digits. The mean μ is 3 rad, and the "
-            "angle φ differs from it by 0 to ±1e6 rad. Few elements are computed by torch operations, and "
-            f"{FEWEST:,} or more (many) by compiled code; `torch.compile` is the code that torch compiles.",
+            "The table gives the largest errors of the log-density log p of a von Mises density, of its derivatives "
+            "in κ and μ, and of the entropy, in machine epsilons of the dtype. The references have 60 digits. The "
+            "mean μ is 3 rad, and the angle φ differs from it by 0 to ±1e6 rad. Few elements are computed by torch "
+            f"operations, and {FEWEST:,} or more (many) by compiled code; `torch.compile` is the code that torch "
+            "compiles.",
             "",
-            "The errors of log p and of the entropy are relative to max(1, |reference|). The error of d/dμ is relative "
-            "to the reference. The error of d/dκ is relative to |cos(φ-μ) - 1| + 1 - A(κ), because d/dκ is a "
-            "difference of these two terms; A(κ) is I₁(κ)/I₀(κ).",
+            "The errors of the log-density log p and of the entropy of a von Mises density are relative to max(1, "
+            "|reference|). The error of d/dμ is relative to the reference. The error of d/dκ is relative to "
+            "|cos(φ-μ) - 1| + 1 - A(κ), because d/dκ is a difference of these two terms; A(κ) is I₁(κ)/I₀(κ).",
             "",
             *accuracy_table(),
             "",
-            "Two further functions were compared with references. The largest relative error of κ from its moments "
-            f"(eq. 3.5), for κ from 1e-8 to 1e12, is {largest_error_from_moments():.1e}. The largest difference of the "
-            f"distribution function at κ = 1e30 from that of a normal density is {largest_error_of_cdf():.1e}.",
+            "Two further functions of von Mises densities were compared with references. The largest relative error "
+            "of the concentration κ that is computed from moments (eq. 3.5), for κ from 1e-8 to 1e12, is "
+            f"{largest_error_from_moments():.1e}. The largest difference of the distribution function at κ = 1e30 "
+            f"from that of a normal density is {largest_error_of_cdf():.1e}.",
             "",
             "## Entropy of mixtures",
             "",
-            "The table gives the largest error of the entropy of random mixtures of K von Mises densities, compared "
-            "with quadrature in 50 digits. κ is between 0 and 1e30, and equal or different for the components. The "
-            "means are far apart, scattered by three widths of a component, or equal. About a tenth of the weights is "
-            "0. In float32, the reference is computed for the parameters as they are rounded to float32.",
+            "The table gives the largest error of the computed entropy of random mixtures of K von Mises densities, "
+            "compared with quadrature in 50 digits. The concentration κ is between 0 and 1e30, and equal or "
+            "different for the components. The means are far apart, scattered by three widths of a component, or "
+            "equal. About a tenth of the weights is 0. In float32, the reference is computed for the parameters as "
+            "they are rounded to float32.",
             "",
             *mixture_table(),
             "",
