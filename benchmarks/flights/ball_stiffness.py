@@ -80,17 +80,17 @@ def main() -> None:
         "flights of a ball that bounces on a table top. Each row of the results has a harder table top, which "
         "makes the differential equation stiffer. The page shows which solvers still succeed.",
         "",
-        f"A ball falls {100 * HEIGHT:g} cm onto the table top, which acts as a critically damped spring with the "
-        "frequency Ω. The ball bounces several times, each time less high, and then lies still. The simulation ends "
-        "after "
-        f"{SECONDS:g} s. The relative tolerance is {TOLERANCE:g}, and a solver may take at most {STEPS:,} steps. Air "
-        "resistance and friction are switched off, because the exact solution is not known with them.",
+        f"In the simulation, a ball falls {100 * HEIGHT:g} cm onto a table top, which acts as a critically damped "
+        "spring with the frequency Ω. The ball bounces several times, each time less high, and then lies still. The "
+        f"simulation ends after {SECONDS:g} s. The relative tolerance is {TOLERANCE:g}, and a solver may take at most "
+        f"{STEPS:,} steps. Air resistance and friction are switched off, because the exact solution is not known with "
+        "them.",
         "",
-        f"The column `stiffness ratio` holds the {SECONDS:g} s of the flight divided by the duration 1/Ω of a contact. "
-        "The other columns hold three numbers for each solver: the error in metres / the number of evaluations of the "
-        "derivative / the processor time in ms. The error is the largest difference between the computed height of the "
-        "ball and its true height at 101 times. The true height comes from a closed form (`closed_form.py`) that is "
-        "computed with 50 digits.",
+        f"In the table of results, `stiffness ratio` is the simulated time of {SECONDS:g} s divided by the duration "
+        "1/Ω of a contact of ball and table. The other columns hold three numbers for each solver: the error in "
+        "metres / the number of evaluations of the derivative / the processor time in ms. The error is the largest "
+        "difference between the computed height of the ball and its true height at 101 times. The true height comes "
+        "from a closed form (`closed_form.py`) that is computed with 50 digits.",
         "",
         "| stiffness ratio | " + " | ".join(METHODS) + " |",
         "|---|" + "---|" * len(METHODS),
@@ -106,12 +106,11 @@ def main() -> None:
         text.append(f"| 1e{round(np.log10(ratio))} | " + " | ".join(cells) + " |")
     text += [
         "",
-        "RK45 and DOP853 are explicit methods. An explicit method remains stable only with steps of at most about 3/Ω "
-        "while the ball lies on the table. Its work therefore grows with the stiffness ratio, until the solver reaches "
-        "its limit of steps and gives up. BDF and Radau are implicit methods, and LSODA changes to an implicit method "
-        "if the equation is stiff. Their work grows only slowly, because a harder table top adds only a few more "
-        "bounces. A solver "
-        "that gives up prints a message like this one:",
+        "Of the compared solvers, RK45 and DOP853 are explicit methods. An explicit method remains stable only with "
+        "steps of at most about 3/Ω while the ball lies on the table. Its work therefore grows with the stiffness "
+        "ratio, until the solver reaches its limit of steps and gives up. BDF and Radau are implicit methods, and "
+        "LSODA changes to an implicit method if the equation is stiff. Their work grows only slowly, because a "
+        "harder table top adds only a few more bounces. A solver that gives up prints a message like this one:",
         "",
         f"> {message}",
         "",

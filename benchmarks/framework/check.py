@@ -79,10 +79,10 @@ correct density head.
 
 `mode=check` found {found_count} of {len(lines)} planted faults ({100 * found_count / len(lines):.1f} %).
 
-In each row of the table one thing is changed in a correct density head. The column `fault` names the change, `target`
-names the predicted quantity, and `failed properties` lists every property whose test failed. κ is the concentration of
-a von Mises density, μ is its mean direction, and σ is the standard deviation of a normal density. A row with
-**missed** has no failed test.
+The table lists the planted faults. For each row, one thing is changed in a correct density head. The column `fault`
+names the change, `target` names the predicted quantity, and `failed properties` lists every property whose test
+failed. κ is the concentration of a von Mises density, μ is its mean direction, and σ is the standard deviation of a
+normal density. A row with **missed** is a planted fault that `mode=check` did not find.
 
 | fault | target | failed properties |
 | --- | --- | --- |
@@ -90,10 +90,11 @@ a von Mises density, μ is its mean direction, and σ is the standard deviation 
 
 ## False alarms
 
-`mode=check` gave {sum(map(len, failed.values()))} false alarms. It tested {rows} configurations of the density heads of
-this project with {seeds} random seeds each. It also tested {right_rows} configurations of correct density heads that
-are not part of this project (tests/right_heads.py). Each line of the following list names the random seeds, the density
-head, its configuration and the property whose test failed.
+`mode=check` gave {sum(map(len, failed.values()))} false alarms, which are failed tests of correct density heads. It
+tested {rows} configurations of the density heads of this project with {seeds} random seeds each. It also tested
+{right_rows} configurations of correct density heads that are not part of this project (tests/right_heads.py). Each
+line of the following list names the random seeds, the density head, its configuration and the property whose test
+failed.
 
 {chr(10).join(alarm_lines)}
 

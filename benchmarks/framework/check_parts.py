@@ -175,16 +175,16 @@ def write(
         __file__,
         f"""# What `mode=check` finds in plugins of the group {group}
 
-This page shows how well `mode=check` finds errors in plugins of the group {group}. The benchmark counts two things: the
-planted faults that `mode=check` finds, and its false alarms. A planted fault is a known error that is put into a
-correct plugin. A false alarm is a failed test of a correct plugin.
+This page shows how well `mode=check` finds errors in plugins of the registry `{group}`. The benchmark counts two
+things: the planted faults that `mode=check` finds, and its false alarms. A planted fault is a known error that is put
+into a correct plugin. A false alarm is a failed test of a correct plugin.
 
 ## Planted faults
 
 `mode=check` found {caught} of {count} planted faults ({100 * caught / max(count, 1):.1f} %).
 
-In each row of the table one thing is changed in a correct plugin. The column `fault` names the change, and
-`failed properties` lists every property whose test failed.
+The table lists the planted faults. For each row, one thing is changed in a correct plugin of the registry `{group}`.
+The column `fault` names the change, and `failed properties` lists every property whose test by `mode=check` failed.
 
 | fault | failed properties |
 | --- | --- |
@@ -192,15 +192,17 @@ In each row of the table one thing is changed in a correct plugin. The column `f
 
 ## False alarms
 
-`mode=check` gave {len(alarms)} false alarms. It tested {rows} constructions of the plugins of this project and
-{len(external_plugins(group))} correct plugins that are not part of it, with {seeds} random seeds each.
+`mode=check` gave {len(alarms)} false alarms, which are failed tests of correct plugins. It tested {rows}
+constructions of the plugins of this project and {len(external_plugins(group))} correct plugins that are not part of
+it, with {seeds} random seeds each.
 
 {chr(10).join(f"- {alarm}" for alarm in alarms)}
 
 ## Run time
 
-The table shows the processor time that `mode=check` needs for all rows of a plugin on one thread. It holds the median
-and the range over the random seeds. Other processes ran at the same time.
+The table shows the processor time that `mode=check` needs on one thread to test a plugin of the registry `{group}` in
+all its constructions. It holds the median and the range over the random seeds. Other processes ran on the machine at
+the same time.
 
 | plugin | median, s | range, s |
 | --- | --- | --- |

@@ -186,34 +186,38 @@ INTRODUCTION = """# Prediction and the start of commands
 This page shows how long commands take before they begin their work, and how long `mode=predict` takes for a table of
 100,000 rows.
 
-Every number is the median of five rounds, with the smallest and the largest round in brackets. Each measurement is a
-new process with one thread. In each round, the commands of a table run one after the other. The processor time is that
-of the command and of its child processes. `before` is commit 950f55d, whose commands run in the same rounds.
+Every time in the tables is the median of five rounds, with the smallest and the largest round in brackets. Each
+measurement is a new process with one thread. In each round, the commands of a table run one after the other. The
+processor time is that of the command and of its child processes. `before` is commit 950f55d, whose commands run in the
+same rounds.
 
-Command: `python -m benchmarks.framework.predict --before <folder with commit 950f55d>`; the names of the sections
-(`start`, `training`, `reals`, `angles`) measure only these sections.
+The command that measures this page is `python -m benchmarks.framework.predict --before <folder with commit 950f55d>`.
+With the name of a section (`start`, `training`, `reals` or `angles`) it measures only this section.
 """
 START_TEXT = {
-    "start": """The commands do little more than start: `predict` predicts two rows, and `encode` encodes one cloud.
-The first two rows are lower bounds: PyTorch alone, and a script that only loads the model. The wanted value is 2.3 s
-for both commands. `encode` misses it: the normalisation of clouds is compiled code, which needs numba, and the import
-of numba with its parts of SciPy takes the rest.
+    "start": """This section measures how long the commands `mode=predict` and `mode=encode` take to start. They do
+little else: `predict` predicts two rows of a table, and `encode` encodes one point cloud. The first two rows of the
+results are lower bounds: PyTorch alone, and a script that only loads the model. The wanted value is 2.3 s for both
+commands. `encode` misses it: the normalisation of clouds is compiled code, which needs numba, and the import of numba
+with its parts of SciPy takes the rest.
 """,
-    "training": """`train` trains a small network for three epochs on 2,000 rows and tests it, and `test` tests it on
-300 rows. Both draw no figures. Most of the start of a training is the import of Lightning, with PyTorch's compiler and
-SymPy.
+    "training": """This section measures how long training and testing take to start. `train` (`mode=train`) trains a
+small network for three epochs on 2,000 rows of a table and tests it, and `test` (`mode=test`) tests it on 300 rows.
+Both draw no figures. Most of the start of a training is the import of Lightning, with PyTorch's compiler and SymPy.
 """,
 }
 ROWS_TEXT = {
-    "reals": """The model predicts one real number with a normal density from six columns, in blocks of 64 rows. The
-interval has the probability 0.9, and its ends are exact. The bare loop loads the model, reads the table with NumPy, and
-predicts the mode of the same blocks. It computes no entropy and writes nothing. The wanted value is 4 s with intervals.
-The times include the start of the command.
+    "reals": """The table shows the time of `mode=predict` for 100,000 rows. The model predicts one real number with a
+normal density from six columns, in blocks of 64 rows. The interval has the probability 0.9, and its ends are exact. For
+comparison, a bare loop loads the model, reads the table with NumPy, and predicts the mode of the same blocks. It
+computes no entropy and writes nothing. The wanted value is 4 s with intervals. All times include the start of the
+command.
 """,
-    "angles": """This model predicts an angle with a von Mises density. The ends of the intervals come from Newton's
-method on the distribution function. Before, they came from a general search, which evaluated the distribution function
-some fifty times for each block: 7 s for 5,000 rows, which is 140 s for this table and is not measured here. The wanted
-value of 4 s is missed: about five rounds of Newton's method, each with a quadrature, take 3.6 ms for a block.
+    "angles": """The table shows the time of `mode=predict` for 100,000 rows. This model predicts an angle with a von
+Mises density. The ends of the intervals come from Newton's method on the distribution function. Before this change, the
+ends came from a general search, which evaluated the distribution function some fifty times for each block: 7 s for
+5,000 rows, which is 140 s for this table and is not measured here. The wanted value of 4 s is missed: about five rounds
+of Newton's method, each with a quadrature, take 3.6 ms for a block.
 """,
 }
 SECTIONS: dict[str, tuple[str, Callable[[Path, Path | None], str]]] = {

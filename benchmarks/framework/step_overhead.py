@@ -244,9 +244,9 @@ def main() -> None:
             "framework. The plain loops use the same number of samples, batch size, fused optimiser and clipping of "
             "gradients.",
             "",
-            f"Each time is the median of {ROUNDS} rounds (least to largest) of wall time on one thread. The loops "
-            "alternate. The last two columns hold the framework's time divided by the time of a plain loop. A ratio of "
-            "1 means that the framework costs no time.",
+            f"Each time of a training step is the median of {ROUNDS} rounds (least to largest) of wall time on one "
+            "thread. The framework and the plain loops run in turn. The last two columns hold the framework's time "
+            "divided by the time of a plain loop. A ratio of 1 means that the framework costs no time.",
             "",
             f"| training | {', ms a step | '.join(loops)}, ms a step | ratio to plain loop, plain model | ratio to "
             "plain loop, framework's model |",

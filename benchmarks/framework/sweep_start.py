@@ -88,10 +88,11 @@ def main() -> None:
             "On Linux the framework uses forks (`hydra.launcher.fork`). The forked process has imported PyTorch and "
             "Lightning, so that a job need not import them again. The benchmark shows how much time this saves.",
             "",
-            f"The sweep has {JOBS} jobs, of which {AT_ONCE} run at once. Each job is a very short training run "
-            f"(`{' '.join(RUNS)}`). All times are in seconds and are medians of {ROUNDS} sweeps; the two ways "
-            "alternate. The processor time of a job does not include the process that is forked. That of the sweep "
-            "includes it. The last row holds the numbers of new processes divided by those of forks.",
+            f"The measured sweep has {JOBS} jobs, of which {AT_ONCE} run at once. Each job is a very short training "
+            f"run (`{' '.join(RUNS)}`). All times are in seconds and are medians of {ROUNDS} sweeps; sweeps with "
+            "forks and with new processes alternate. The processor time of a job does not include the process from "
+            "which it is forked; the processor time of the sweep includes it. The last row holds the times with new "
+            "processes divided by the times with forks.",
             "",
             "| start of the jobs | wall time of the sweep, s | processor time of the sweep, s | processor time of a "
             "job, s |",

@@ -55,10 +55,11 @@ def main() -> None:
             f"created in the run) and with `logger=none`. `before` is the version of commit `{commit}`, `after` is "
             "this version.",
             "",
-            "The first two columns are differences between the two runs. Processor time is that of the command with "
-            "all its processes. The last column is the time between the last line of the journal, which says that the "
-            f"run has finished, and the end of the command. Each cell is the median of {ROUNDS} rounds (least to "
-            "largest); in each round, all runs are made one after the other.",
+            "The first two columns of the table are differences between the run with `logger=mlflow` and the run "
+            "with `logger=none`. Processor time is that of the command with all its processes. The last column is "
+            "the time between the last line of the journal, which says that the run has finished, and the end of the "
+            f"command. Each number is the median of {ROUNDS} rounds (least to largest); in each round, all runs are "
+            "made one after the other.",
             "",
             "| version | processor time that the store adds, s | wall time that the store adds, s | waiting at the "
             "end, s |",

@@ -202,34 +202,34 @@ def report() -> None:
         "# fit_pose: a body's pose by gradient descent through the rasteriser",
         "",
         "This page shows how well the pose of a body can be found from one image by gradient descent through a "
-        "renderer. It compares three gradients of the rendered image. `boundary` includes the movement of the edges "
-        "of faces (Li et al. 2018), `nmr` is an approximation (Kato et al. 2018), and `soft` is the exact gradient of "
-        "a blurred image (Liu et al. 2019).",
+        "renderer. It compares three methods to compute the gradient of the rendered image. `boundary` includes the "
+        "movement of the edges of faces (Li et al. 2018), `nmr` is an approximation (Kato et al. 2018), and `soft` "
+        "is the exact gradient of a blurred image (Liu et al. 2019).",
         "",
-        "The images are synthetic. Each shows the default body (13,718 vertices) with a random shape and a random "
-        "pose, 128 × 96 pixels, with 8 × 8 samples a pixel. Every descent starts from the same nominal position. The "
-        "true body is rotated from there by exactly 30° about a random axis and moved by 20 cm in a random direction. "
-        "The descent fits 30 parameters: rotation, translation, 20 movements of joints and 4 parameters of the shape. "
-        "It is the descent that the density head `fit_pose` uses. All gradients have the same settings, and a "
+        "The bodies are fitted to synthetic images. Each image shows the default body (13,718 vertices) with a "
+        "random shape and a random pose, 128 × 96 pixels, with 8 × 8 samples a pixel. Every descent starts from the "
+        "same nominal position. The true body is rotated from there by exactly 30° about a random axis and moved by "
+        "20 cm in a random direction. The descent fits 30 parameters: rotation, translation, 20 movements of joints "
+        "and 4 parameters of the shape. It is the gradient descent that the density head `fit_pose` uses. Its "
+        "settings are the same for the three methods to compute the gradient (`boundary`, `nmr` and `soft`), and a "
         "descent may restart at most once.",
         "",
-        "`samples a pixel` is the number of samples with which the descent renders its images. `images` is the "
-        "number of images to which the body was fitted. There are 100 images, and a smaller number means the "
-        "first ones of them. `fits within 2° and 1 cm` counts the fits "
-        "whose rotation error is at most 2° and whose translation error is at most 1 cm. The following columns hold "
-        "the median, the 95 % quantile and the largest value of both errors. The last two columns hold the processor "
-        "time of a fit.",
+        "In the table, `samples a pixel` is the number of samples with which the descent renders its images. "
+        "`images` is the number of images to which the body was fitted. There are 100 images, and a smaller number "
+        "means the first ones of them. `fits within 2° and 1 cm` counts the fits whose rotation error is at most 2° "
+        "and whose translation error is at most 1 cm. The following columns hold the median, the 95 % quantile and "
+        "the largest value of both errors. The last two columns hold the processor time of a fit.",
         "",
         *table(results),
         "",
-        "The times, in seconds, were measured on one thread while other processes used the machine. This makes them "
-        "longer. They do not include compilation.",
+        "The processor times of a fit, in seconds, were measured on one thread while other processes used the "
+        "machine, which makes them longer. They do not include the compilation of the renderer.",
         "",
         f"![Start, target and end of the fits to image {typical}; errors against steps and time](fit_pose.png)",
         "",
-        f"The upper half of the figure shows the fits to image {typical}. Its error with `boundary` is the median one. "
-        "The lower half shows the medians of the errors as lines and the range between the quartiles as bands. A "
-        "restart appears as a jump.",
+        f"The upper half of the figure shows the fits of a body to image {typical}, whose error with the gradient "
+        "`boundary` is the median of all images. The lower half shows the errors of the fitted pose during the "
+        "descent: the medians as lines, and the range between the quartiles as bands. A restart appears as a jump.",
         "",
         f"{machine('torch', 'numba', 'numpy')} Command: `python -m benchmarks.pose.fit_pose`.",
         "",

@@ -232,15 +232,15 @@ This page shows how exactly registered people can be posed and shaped anew. A re
 topology that was fitted to a scan. The benchmark changes the pose or the shape of such a mesh and compares the result
 with the true mesh in that pose or shape.
 
-There are {PEOPLE} synthetic people of random shape, registered in an A-pose as `human_scans` does it. Their pose and
-shape are found from the vertices alone. Each person is then put into {POSES} random poses. Each person is also reshaped
-by plus and minus two standard deviations along each of the first three directions of the shape space (thesis Figures
-7.4 and 7.5). The reference is the same dressed person, registered in the new pose or shape.
+The benchmark uses {PEOPLE} synthetic people of random shape, registered in an A-pose as `human_scans` does it. Their
+pose and shape are found from the vertices alone. Each person is then put into {POSES} random poses. Each person is
+also reshaped by plus and minus two standard deviations along each of the first three directions of the shape space
+(thesis Figures 7.4 and 7.5). The reference is the same dressed person, registered in the new pose or shape.
 
-The columns stand for two topologies, with about 7,000 and about 27,000 vertices. If a cell holds two numbers, these
-are the median and the 95 % quantile of the distances between corresponding vertices, in mm. Rows in bold hold the
-method of this project. The rows below a bold row leave out one part of the method, replace one part by the truth, or
-change the pose in the opposite direction.
+The columns of the table stand for two topologies of the mesh, with about 7,000 and about 27,000 vertices. If a cell
+holds two numbers, these are the median and the 95 % quantile of the distances between corresponding vertices, in mm.
+Rows in bold hold the method of this project. The rows below a bold row leave out one part of the method, replace one
+part by the truth, or change the pose in the opposite direction.
 
 {report(tables)}
 

@@ -246,15 +246,15 @@ def report() -> str:
             "This page measures the processor time that the renderer `rasterizer` needs for one image. It compares "
             "the channels of the image, the number of vertices, and forward rendering with gradients.",
             "",
-            f"The image has {HEIGHT} rows × {WIDTH} columns and shows a synthetic closed body, which covers "
+            f"The rendered image has {HEIGHT} rows × {WIDTH} columns and shows a synthetic closed body, which covers "
             f"{cover:.0%} of the pixels. A time is the lowest of {ROUNDS} medians of 40 calls on one thread. The "
             "renderer keeps nothing from one image to the next.",
             "",
-            "The first column holds the number of vertices and faces and the kind of image. `in view`: the body is in "
-            "front of the camera. `out of view`: the body is behind the camera. `culled`: faces seen from behind are "
-            "left out (`cull=True`). `interior`: the gradient leaves out the movement of edges (`gradient=interior`). "
-            "The other columns hold the time in ms for the named channels. The last two columns include the gradient "
-            "of the colours with respect to the vertices or to the vertex colours.",
+            "The first column of the table holds the number of vertices and faces and the kind of image. `in view`: "
+            "the body is in front of the camera. `out of view`: the body is behind the camera. `culled`: faces seen "
+            "from behind are left out (`cull=True`). `interior`: the gradient leaves out the movement of edges "
+            "(`gradient=interior`). The other columns hold the time in ms to render the named channels. The last two "
+            "columns include the gradient of the colours with respect to the vertices or to the vertex colours.",
             "",
             f"| vertices / faces, kind of image | {' | '.join(' + '.join(names) + ', ms' for names in CHANNELS)} | "
             + " | ".join(f"color with gradient of {name}, ms" for name in LEARNED)
@@ -262,18 +262,19 @@ def report() -> str:
             "|---|" + "---|" * wide,
             *rows,
             "",
-            f"The first image of a process, with the channels color, depth, face and mask, takes {cold:.1f} s if the "
-            f"code must be compiled. It takes {warm:.2f} s if the compiled code is read from the cache.",
+            f"The first image that a process renders, with the channels color, depth, face and mask, takes {cold:.1f} "
+            f"s if the code must be compiled. It takes {warm:.2f} s if the compiled code is read from the cache.",
             "",
             "## Savings",
             "",
-            "The renderer can skip work without changing the image. The table shows how much time each of these "
-            "savings brings. For each row one saving is switched off and on. `back` is the culling of faces seen from "
-            "behind; the other savings are explained at the parameter `savings` of the class `Rasterizer`. `channels` "
-            "compares an image of the channel `mask` with an image of all channels except `uv`. The last column "
-            "counts the faces that are left out: `flat` faces cover no area, `back` faces are seen from behind, "
-            "`outside` faces do not lie in the image, and `hidden` faces lie behind others. It also names what is "
-            "reused from the previous image: checked `faces`, or the `places` of projected vertices.",
+            "The renderer `rasterizer` has optimisations, called savings, that skip work without changing the image. "
+            "The table shows how much time each of them saves. For each row one saving is switched off and on. "
+            "`back` is the culling of faces seen from behind; the other savings are explained at the parameter "
+            "`savings` of the class `Rasterizer`. `channels` compares an image of the channel `mask` with an image "
+            "of all channels except `uv`. The last column counts the faces that are left out: `flat` faces cover no "
+            "area, `back` faces are seen from behind, `outside` faces do not lie in the image, and `hidden` faces "
+            "lie behind others. It also names what is reused from the previous image: checked `faces`, or the "
+            "`places` of projected vertices.",
             "",
             "| saving | scene | without it, ms | with it, ms | faces left out |",
             "|---|---|---|---|---|",
@@ -281,33 +282,34 @@ def report() -> str:
             "",
             "## Batches",
             "",
-            "`Renderer.batch` renders several images at once. The table compares the number of images per second of "
-            "wall time with that of single images. It holds the best of 25 repetitions. `ratio` is the number of "
-            "images per second divided by that of the first row.",
+            "The method `Renderer.batch` of the renderer `rasterizer` renders several images at once. The table "
+            "compares the number of images per second of wall time with that of single images. It holds the best of "
+            "25 repetitions. `ratio` is the number of images per second divided by that of the first row.",
             "",
             *batch_table(scenes[0]),
             "",
             "## Growth with the number of faces and pixels",
             "",
-            "The time of an image of a synthetic ball is measured for different numbers of faces and pixels. Each "
-            "entry of the table is the number of faces or pixels, followed by the time in ms. `slope` is the slope of "
-            "the time on double logarithmic axes, over the upper half of the numbers: 1 means that the time is "
-            "proportional to the number.",
+            "This table shows how the time of an image grows. The time of an image of a synthetic ball is measured "
+            "for different numbers of faces and pixels. Each entry of the table is the number of faces or pixels, "
+            "followed by the time in ms. `slope` is the slope of the time on double logarithmic axes, over the upper "
+            "half of the numbers: 1 means that the time is proportional to the number.",
             "",
             *rasterizer_growth.report(Path(__file__).with_name("rasterizer_growth.png")),
             "",
             "## Other renderers",
             "",
-            "Other renderers draw the same two scenes. The table holds milliseconds of processor time of all threads, "
-            f"for {len(bodies[0][0]):,} / {len(bodies[1][0]):,} vertices.",
+            "This table compares the renderer `rasterizer` with other renderers, which draw the same two scenes of a "
+            f"body. It holds milliseconds of processor time of all threads, for {len(bodies[0][0]):,} / "
+            f"{len(bodies[1][0]):,} vertices.",
             "",
             "| renderer | processor time, ms |",
             "|---|---|",
             f"| rasterizer (culled) | {own_times} |",
             *rasterizer_peers.rows(scenes),
             "",
-            "The following renderers were not run for this page. Their times were measured on another machine, two "
-            "cores of a Sapphire Rapids Xeon.",
+            "The following renderers were not run for this page. Their times per image were measured on another "
+            "machine, two cores of a Sapphire Rapids Xeon.",
             "",
             "| renderer | processor time, ms |",
             "|---|---|",

@@ -62,17 +62,17 @@ def report() -> str:
             "This page checks that the renderer `rasterizer` covers each pixel of a surface exactly once. Pixels that "
             "no triangle covers would appear as holes. Pixels that two triangles cover would be drawn twice.",
             "",
-            f"The surface is a tessellated plane of 8 × 8 m under {CAMERAS:,} random cameras. The cameras have any "
-            "azimuth, elevation and tilt, distances of 0.05 to 10,000 m, focal lengths of 0.001 to 1,000,000 pixels, "
-            "and images of 1 to 64 pixels a side. Their principal points may lie outside of the image, and the near "
-            "plane may cut the surface. A third of the cameras look straight at the plane, so that edges run through "
-            "pixel centres. Each face is drawn alone, and the faces that cover a pixel are counted. Rays decide which "
-            "pixels show the plane. Pixels within 1/128 pixel of its border are left out.",
+            f"The first test draws a surface, a tessellated plane of 8 × 8 m, with {CAMERAS:,} random cameras. The "
+            "cameras have any azimuth, elevation and tilt, distances of 0.05 to 10,000 m, focal lengths of 0.001 to "
+            "1,000,000 pixels, and images of 1 to 64 pixels a side. Their principal points may lie outside of the "
+            "image, and the near plane may cut the surface. A third of the cameras look straight at the plane, so "
+            "that edges run through pixel centres. Each face is drawn alone, and the faces that cover a pixel are "
+            "counted. Rays decide which pixels show the plane. Pixels within 1/128 pixel of its border are left out.",
             "",
-            "`regular` is a plane of equal squares that are divided into triangles, and `loose` is a plane of random "
-            "triangles. The other columns are counts of cameras and pixels. `pixels on the plane` must be covered "
-            "once. `differs from the whole mesh` counts the pixels whose coverage changes if all faces are drawn "
-            "together.",
+            "In the table, `regular` is a plane of equal squares that are divided into triangles, and `loose` is a "
+            "plane of random triangles. The columns of numbers count cameras and pixels. `pixels on the plane` are "
+            "pixels that must be covered exactly once. `differs from the whole mesh` counts the pixels whose "
+            "coverage changes if all faces are drawn together.",
             "",
             "| plane | cameras | pixels on the plane | pixels without a face | pixels with several faces | covered "
             "pixels outside of the plane | differs from the whole mesh |",
@@ -81,10 +81,10 @@ def report() -> str:
             "",
             f"The count took {seconds:.0f} s.",
             "",
-            f"The second test draws a closed body of 27,554 vertices in {VIEWS} views of {HEIGHT} × {WIDTH} pixels. "
-            f"It covers {covered:,} pixels and has {holes} holes. Then the faces seen from behind are left out, and "
-            f"{cracks} pixels show another face than before. Such a pixel would be a crack between two faces. Pixels "
-            "at the outline and their neighbours are not counted.",
+            f"The second test of the coverage draws a closed body of 27,554 vertices in {VIEWS} views of {HEIGHT} × "
+            f"{WIDTH} pixels. It covers {covered:,} pixels and has {holes} holes. Then the faces seen from behind are "
+            f"left out, and {cracks} pixels show another face than before. Such a pixel would be a crack between two "
+            "faces. Pixels at the outline and their neighbours are not counted.",
             "",
             f"{machine('numba', 'numpy')} Command: `python -m benchmarks.rendering.rasterizer_coverage`.",
             "",

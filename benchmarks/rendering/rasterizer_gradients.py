@@ -162,19 +162,21 @@ def main() -> None:
     text = [
         "# rasterizer: accuracy and run time of four gradients",
         "",
-        "This page compares the four gradients of the renderer `rasterizer` with a reference, and measures their run "
-        "time. It shows how exact each gradient is for fitting a scene to an image.",
+        "The renderer `rasterizer` has four methods to compute the gradient of an image with respect to the scene: "
+        "`boundary`, `interior`, `nmr` and `soft`. This page compares the gradient of each method with a reference, "
+        "and measures its run time. It shows how exact the gradients are when a scene is fitted to an image.",
         "",
-        "The scene is a synthetic body with 3,280 vertices that hides parts of itself, in images of 72 × 88 pixels. "
-        "The loss is the squared difference of the colours from an image of another pose. The reference is the "
-        "gradient of this loss from central differences of an image with 16 × 16 samples a pixel. All gradients are "
-        "measured in 4 views.",
+        "The rendered scene is a synthetic body with 3,280 vertices that hides parts of itself, in images of 72 × 88 "
+        "pixels. The loss is the squared difference of the colours from an image of another pose. The reference is "
+        "the gradient of this loss from central differences of an image with 16 × 16 samples a pixel. All four "
+        "methods are measured in 4 views.",
         "",
-        "`boundary` is the gradient with the movement of edges (Li et al., SIGGRAPH Asia 2018), and `interior` is the "
-        "same gradient without it. `nmr` is the approximation of Kato et al. (CVPR 2018). `soft` is the blurred image "
-        "of Liu et al. (ICCV 2019). Its gradient is exact for the blurred image; the table shows how far it is from "
-        "the gradient of the sharp image. `knob` is the setting that trades error for run time: the samples a pixel "
-        "along each axis, or the width of the blur.",
+        "The methods are named in the first column of the table. `boundary` is the gradient with the movement of "
+        "edges (Li et al., SIGGRAPH Asia 2018), and `interior` is the same gradient without it. `nmr` is the "
+        "approximation of Kato et al. (CVPR 2018). `soft` is the blurred image of Liu et al. (ICCV 2019). Its "
+        "gradient is exact for the blurred image; the table shows how far it is from the gradient of the sharp "
+        "image. `knob` is the setting that trades error for run time: the samples a pixel along each axis, or the "
+        "width of the blur.",
         "",
         "The columns `vertices` to `vertices, textured` hold two numbers for each group of parameters: the cosine of "
         "the angle between the gradient and the reference, and the length of the gradient divided by that of the "
@@ -183,9 +185,9 @@ def main() -> None:
         "`texture` and `vertices, textured` the body has a smooth texture instead of colours: 3 changes of the "
         "texture, and the 8 deformations. `soft` draws no textures.",
         "",
-        "The last two columns hold the time of forward and backward rendering in ms: for the loss above, and for a "
-        f"body with 6,890 vertices in {HEIGHT} × {WIDTH} pixels with the gradient of its vertices. The time is the "
-        "median processor time of 10 calls on one thread.",
+        "The last two columns of the table hold the time of forward and backward rendering in ms: for the loss and "
+        f"the body of this benchmark, and for a body with 6,890 vertices in {HEIGHT} × {WIDTH} pixels with the "
+        "gradient of its vertices. The time is the median processor time of 10 calls on one thread.",
         "",
         *table(rows),
         "",

@@ -77,13 +77,14 @@ def report() -> str:
             "",
             "This page measures the peak memory that the renderer `rasterizer` needs for one image and its gradient.",
             "",
-            f"The image (`color`, {HEIGHT} × {WIDTH} pixels) shows a synthetic body of 27,554 vertices. The gradient "
-            "is with respect to vertices and vertex colours. The image is the first one of its renderer. Each row is "
-            "measured in a new process that has drawn a small image before, so that all code is compiled.",
+            f"The image whose memory is measured (`color`, {HEIGHT} × {WIDTH} pixels) shows a synthetic body of "
+            "27,554 vertices. The gradient is with respect to vertices and vertex colours. The image is the first "
+            "one of its renderer. Each row is measured in a new process that has drawn a small image before, so that "
+            "all code is compiled.",
             "",
-            "`growth of the process` is the increase of the peak memory of the process, without inputs and outputs. "
-            "`NumPy and Python` is the peak of the memory that these two allocate, with outputs. `inputs and outputs` "
-            "is the size of the arrays that the caller holds.",
+            "In the table, `growth of the process` is the increase of the peak memory of the process, without inputs "
+            "and outputs. `NumPy and Python` is the peak of the memory that NumPy and Python allocate, including "
+            "outputs. `inputs and outputs` is the size of the arrays of inputs and outputs, which the caller holds.",
             "",
             "| gradient | growth of the process, MiB | NumPy and Python, MiB | inputs and outputs, MiB |",
             "|---|---|---|---|",

@@ -157,8 +157,8 @@ def rates(run: str, scene: Scene) -> list[str]:
         for name, times in times_by_name.items()
     ]
     return [
-        "The table holds the processor time of one image in a loop on one thread. The last row is the wall time "
-        "that the training run measured at its end.",
+        "This table holds the processor time to compute one image in a loop on one thread. The last row is the wall "
+        "time that the training run measured at its end.",
         "",
         "| way to predict | median, ms | shortest, ms |",
         "|---|---|---|",
@@ -207,24 +207,25 @@ def report(run: str, file: Path) -> str:
             "",
             f"The network SMPLpix consists of {describe_training(run)}",
             "",
-            f"{len(SUBJECTS)} generated people who are not in the training data walk; their motion is read from the "
-            f"file `{file.name}`. There are {FRAMES} images of each person, at {SPEED} images a second, with "
-            f"{scenes[0].camera.height} × "
-            f"{scenes[0].camera.width} pixels. Each image is moved to the next one with bilinear interpolation. The "
-            "optical flow for this is known exactly, because it is computed from the visible faces and barycentric "
-            "weights of the registered mesh. The difference of the two images is then taken at pixels whose point is "
-            f"visible in both images and that are not near an outline. These are {statistics.mean(covered):.1%} of a "
-            "frame.",
+            f"The images show {len(SUBJECTS)} generated people who are not in the training data and who walk; their "
+            f"motion is read from the file `{file.name}`. There are {FRAMES} images of each person, at {SPEED} images "
+            f"a second, with {scenes[0].camera.height} × {scenes[0].camera.width} pixels. The flicker is computed as "
+            "follows. Each image is warped to the next one with bilinear interpolation. The optical flow for this "
+            "warp is known exactly, because it is computed from the visible faces and barycentric weights of the "
+            "registered mesh. The difference between the warped and the next image is then taken at pixels whose "
+            "point is visible in both images and that are not near an outline. These are "
+            f"{statistics.mean(covered):.1%} of a frame.",
             "",
-            "`mean difference` is the mean over these pixels, all pairs of images and all people, on the scale of 0 "
-            "to 255 of sRGB values. `SD over people` shows by how much this mean differs from person to person. `95th "
-            "percentile` is over the same pixels as the mean. The last column is the mean divided by that of the "
-            "photographs. The rows `mesh` are renders of the registered mesh with 1 or 4 × 4 samples a pixel.",
+            "In the table, `mean difference` is the mean difference between an image and the warped previous image, "
+            "over the pixels visible in both, all pairs of images and all people, on the scale of 0 to 255 of sRGB "
+            "values. `SD over people` shows by how much this mean differs from person to person. `95th percentile` "
+            "is over the same pixels as the mean. The last column is the mean divided by that of the photographs. "
+            "The rows `mesh` are renders of the registered mesh with 1 or 4 × 4 samples a pixel.",
             "",
-            "The photographs show how much of the difference is present in a true image. Interpolation blurs fine "
-            "patterns, cloth moves differently from the registered body, and the light changes when the body turns. A "
-            "mesh whose vertices have fixed colours shows less of all three. Its difference may therefore be smaller "
-            "than that of the photographs.",
+            "The photographs show how much of the difference between consecutive images is present in true images. "
+            "Interpolation blurs fine patterns, cloth moves differently from the registered body, and the light "
+            "changes when the body turns. A mesh whose vertices have fixed colours shows less of all three. Its "
+            "difference may therefore be smaller than that of the photographs.",
             "",
             "| way to draw | mean difference | SD over people | 95th percentile | mean relative to photographs |",
             "|---|---|---|---|---|",

@@ -102,20 +102,19 @@ def report(figure_path: Path) -> str:
             "",
             "This page measures how the run time of an image grows with the number of vertices of its mesh. It "
             "compares rendering of the mesh with neural networks (SMPLpix) that draw the image from projected "
-            "vertices. Networks should depend less on the number of vertices.",
+            "vertices. The run time of the networks should depend less on the number of vertices.",
             "",
-            f"The images have {SIZE[0]} × {SIZE[1]} pixels and show the default body with synthetic colours, which "
-            f"covers {covered:.0%} of the pixels. All numbers except the last two columns are processor times in ms "
-            f"on one thread: the lowest of {ROUNDS} medians. The methods are measured in turn. The networks "
-            f"compute only the pixels in the bounding box of the body. Their weights are random, which does not "
-            f"change the run "
-            "time.",
+            f"The rendered images have {SIZE[0]} × {SIZE[1]} pixels and show the default body with synthetic colours, "
+            f"which covers {covered:.0%} of the pixels. All numbers except the last two columns are processor times "
+            f"in ms on one thread: the lowest of {ROUNDS} medians. The methods are measured in turn. The networks "
+            "compute only the pixels in the bounding box of the body. Their weights are random, which does not "
+            "change the run time.",
             "",
-            "`rasterised` is rendering of the mesh. `projection alone` only projects the vertices into the image. "
-            "`SMPLpix` is projection followed by the network `slim`. `slim over the mesh` is the network on a "
-            "rendered mesh with depth. `last / first` is the time with the most vertices divided by that with the "
-            "fewest. `slope` is the slope of the time between the last two columns of vertices, on double logarithmic "
-            "axes: 1 means that the time is proportional to the number of vertices.",
+            "In the table, `rasterised` is rendering of the mesh. `projection alone` only projects the vertices into "
+            "the image. `SMPLpix` is projection followed by the network `slim`. `slim over the mesh` is the network "
+            "on a rendered mesh with depth. `last / first` is the time with the most vertices divided by that with "
+            "the fewest. `slope` is the slope of the time between the last two columns of vertices, on double "
+            "logarithmic axes: 1 means that the time is proportional to the number of vertices.",
             "",
             f"| way to draw | {' | '.join(f'{count:,} vertices, ms' for count in counts)} | last / first | slope |",
             f"|---|{'---|' * (len(counts) + 2)}",

@@ -259,24 +259,25 @@ def frames_section() -> str:
     lines, times, cover = measure_frames()
     return "\n".join(
         [
-            f"The images show a synthetic body of {body().shape[1]:,} points. The points are projected with splats, "
-            f"which are discs around the points with a radius of {SPLAT} pixels, as in `experiment=smplpix/quick`. "
-            f"The body covers {cover[0]:.0%} of the larger image and {cover[1]:.0%} of the smaller one.",
+            f"The images for the run times show a synthetic body of {body().shape[1]:,} points. The points are "
+            f"projected with splats, which are discs around the points with a radius of {SPLAT} pixels, as in "
+            f"`experiment=smplpix/quick`. The body covers {cover[0]:.0%} of the larger image and {cover[1]:.0%} of "
+            "the smaller one.",
             "",
-            f"A time is the processor time of one thread: the median of {ROUNDS} rounds, with the smallest and "
-            "largest time in brackets. The networks are measured in turn. In the rows `projection` only the "
-            "projection is measured, without or with splats. In the "
-            "other rows `computed area` says whether the network computes the whole frame or only the box around the "
-            "body. `computed pixels` is the number of these pixels, including those beyond the border, divided by the "
-            "number of pixels of the image. `GFLOP` counts each multiplication and each addition of the convolutions.",
+            f"A run time of a network is the processor time of one thread: the median of {ROUNDS} rounds, with the "
+            "smallest and largest time in brackets. The networks are measured in turn. In the rows `projection` only "
+            "the projection is measured, without or with splats. In the other rows `computed area` says whether the "
+            "network computes the whole frame or only the box around the body. `computed pixels` is the number of "
+            "these pixels, including those beyond the border, divided by the number of pixels of the image. `GFLOP` "
+            "counts each multiplication and each addition of the convolutions.",
             "",
             "| image, pixels | network | number format | computed area | time, ms | GFLOP | computed pixels | million "
             "parameters |",
             "|---|---|---|---|---:|---:|---:|---:|",
             *lines,
             "",
-            "The project requires the following run times. A speed ratio is the time of the slower way divided by "
-            "that of the faster one.",
+            "The project requires the following run times of the networks `unet` and `slim`. A speed ratio is the "
+            "time of the slower way to compute an image divided by that of the faster way.",
             "",
             f"| quantity at {SIZES[0][0]} × {SIZES[0][1]} pixels | measured | requirement | result |",
             "|---|---|---|---|",
@@ -304,32 +305,34 @@ def report() -> str:
             "",
             "## Training",
             "",
-            f"The table holds the time of forward and backward evaluation for four images of {SIZES[1][0]} × "
-            f"{SIZES[1][1]} pixels in float32, without the optimiser.",
+            "The table holds the time of the forward and backward pass of each network for four images of "
+            f"{SIZES[1][0]} × {SIZES[1][1]} pixels in float32, without the optimiser.",
             "",
             "| network | time, ms |",
             "|---|---:|",
             *measure_steps(),
             "",
-            "Both networks were trained for about the same time, with seed 0. They were tested on 96 images of 256 × "
-            "192 pixels, which show 16 generated people who are not in the training data. `processor time` is that of "
-            "the whole run on one core. The columns `inside` count only the pixels of the subject.",
+            "Both networks, `unet` and `slim`, were trained for about the same time, with seed 0. They were tested "
+            "on 96 images of 256 × 192 pixels, which show 16 generated people who are not in the training data. "
+            "`processor time` is that of the whole run on one core. The columns `inside` count only the pixels of "
+            "the subject.",
             "",
             "| network | arguments of the training | processor time, minutes | PSNR, dB | PSNR inside, dB | SSIM | "
             "SSIM inside |",
             "|---|---:|---:|---:|---:|---:|---:|",
             *result_rows(networks),
             "",
-            f"The PSNR of unet minus the PSNR of slim is {below:.1f} dB. The project requires that this difference "
-            f"is at most {MOST_BELOW:g} dB. It is negative if the images of slim are better.",
+            f"On the test images, the PSNR (peak signal-to-noise ratio) of unet minus the PSNR of slim is {below:.1f} "
+            f"dB. The project requires that this difference is at most {MOST_BELOW:g} dB. A negative difference means "
+            "that the images of slim are better.",
             "",
             "## Errors by the crop and by bfloat16",
             "",
             f"The trained networks draw images of the test split (slim: {SHOWN['slim']} images, unet: {SHOWN['unet']} "
             "images) with a crop or with bfloat16. Each cell holds the largest difference of a colour value from the "
-            "whole frame in float32, on a scale of 0 to 255, and in brackets the mean difference. `margin` is the "
-            "number of pixels around the box of the subject that the network computes as well. The last two columns "
-            "are two sizes of the image in pixels.",
+            "image that is computed as a whole in float32, on a scale of 0 to 255, and in brackets the mean "
+            "difference. `margin` is the number of pixels around the box of the subject that the network computes as "
+            "well. The last two columns are two sizes of the image in pixels.",
             "",
             "| network | setting | "
             + " | ".join(f"{height} × {width}" for height, width in SIZES[::-1])

@@ -115,17 +115,18 @@ def report() -> str:
             "an image. It compares the compiled code with an implementation in plain PyTorch, for four numbers of "
             "points.",
             "",
-            f"The points are those of a synthetic body, in float32, and the image has {HEIGHT} rows × {WIDTH} "
-            f"columns. A time is the processor time of one call on one thread, in ms: the lowest of {ROUNDS} medians. "
-            "It includes the check of the encoder's input. All implementations gave bitwise equal images in this run.",
+            f"The projected points are those of a synthetic body, in float32, and the image has {HEIGHT} rows × "
+            f"{WIDTH} columns. A time is the processor time of one call on one thread, in ms: the lowest of {ROUNDS} "
+            "medians. It includes the check of the encoder's input. All implementations gave bitwise equal images in "
+            "this run.",
             "",
-            f"The following times are compared with the targets of the project: {targets}.",
+            f"The times to project a cloud are compared with the targets of the project: {targets}.",
             "",
-            "`pixels hit` is the share of pixels that show a point. `compiled` and `PyTorch` are the times of the two "
-            f"implementations, and `ratio` is the time of PyTorch divided by the compiled one. `batch of {BATCH}` is "
-            f"the time for {BATCH} point clouds at once. The last three columns are times of the compiled code: with "
-            "three levels of resolution, with the gradient, and with splats, which are discs around the points with a "
-            f"radius of {SPLAT} pixels.",
+            "In the table, `pixels hit` is the share of pixels that show a point. `compiled` and `PyTorch` are the "
+            "times of the two implementations, and `ratio` is the time of PyTorch divided by the compiled one. "
+            f"`batch of {BATCH}` is the time for {BATCH} point clouds at once. The last three columns are times of "
+            "the compiled code: with three levels of resolution, with the gradient, and with splats, which are discs "
+            f"around the points with a radius of {SPLAT} pixels.",
             "",
             f"| points | pixels hit | compiled, ms | PyTorch, ms | ratio | compiled, batch of {BATCH}, ms | PyTorch, "
             f"batch of {BATCH}, ms | ratio, batch of {BATCH} | compiled, 3 levels, ms | compiled, with gradient, ms | "
@@ -133,13 +134,13 @@ def report() -> str:
             "|---|---|---|---|---|---|---|---|---|---|---|",
             *rows,
             "",
-            f"From {counts[2]:,.0f} points on, the time grows with the number of points to the power of "
-            f"{slope(counts, ours):.2f}. With fewer points, most of the time is spent on the image itself.",
+            f"From {counts[2]:,.0f} points on, the time of a projection grows with the number of points to the power "
+            f"of {slope(counts, ours):.2f}. With fewer points, most of the time is spent on the image itself.",
             "",
-            f"The last table compares one and two threads for a batch of {BATCH} point clouds. A time is wall time "
-            "without the check of the input: the shortest call within half a second. While this was measured, "
-            f"{os.getloadavg()[0]:.1f} processes were running on the machine on average. `ratio` is the time of one "
-            "thread divided by that of two.",
+            f"The last table compares one and two threads for the projection of a batch of {BATCH} point clouds. A "
+            "time is wall time without the check of the input: the shortest call within half a second. While this "
+            f"was measured, {os.getloadavg()[0]:.1f} processes were running on the machine on average. `ratio` is the "
+            "time of one thread divided by that of two.",
             "",
             "| points | 1 thread, ms | 2 threads, ms | ratio |",
             "|---|---|---|---|",

@@ -258,22 +258,22 @@ FIRST = "## Batched least squares compared with SciPy"
 
 def speed_section(file: Path) -> str:
     """Return the section that compares SciPy with the batched fit."""
-    return f"""The table compares SciPy with the batched least squares of this project, which fits all voxels at
-once. The model has 11 or 15 parameters. SciPy runs with the tolerance 1e-14 and with its default 1e-8. The three
-columns after the number of parameters hold milliseconds a voxel: the median of {ROUNDS} rounds (least to largest). In
-each round SciPy fits another fifth of the voxels with 1e-14 and a twentieth of the voxels with 1e-8, and the
-batched fit has all voxels. A speed ratio is SciPy's time divided by that of the batched fit. `whole slice` is the time
-of the batched fit for all voxels.
+    return f"""This table compares the least-squares fit of SciPy with the batched least squares of this project, which
+fits the spectra of all voxels at once. The model has 11 or 15 parameters. SciPy runs with the tolerance 1e-14 and with
+its default 1e-8. The three columns after the number of parameters hold milliseconds a voxel: the median of {ROUNDS}
+rounds (least to largest). In each round SciPy fits another fifth of the voxels with 1e-14 and a twentieth of the
+voxels with 1e-8, and the batched fit has all voxels. A speed ratio is SciPy's time divided by that of the batched
+fit. `whole slice` is the time of the batched fit for all voxels.
 
-The last five columns compare the results with those of SciPy at 1e-14. `sum of squares ≤ SciPy's` is the share of
-voxels where the batched fit is at least as good. `same minimum` is the share of voxels where the parameters are well
-determined and both sums of squares agree. `parameters agree` is the share of these where every parameter agrees to
-1e-6: the difference is at most 1e-6 of the parameter, or 1e-6 of 1 % of its permitted range if that is larger. The
-column `batched nearer` is the share of the remaining voxels where the batched fit is nearer to the minimum. `warnings`
-is the number of voxels for which the batched fit reports a problem.
+The last five columns compare the results of the batched fit with those of SciPy at the tolerance 1e-14.
+`sum of squares ≤ SciPy's` is the share of voxels where the batched fit is at least as good. `same minimum` is the
+share of voxels where the parameters are well determined and both sums of squares agree. `parameters agree` is the
+share of these where every parameter agrees to 1e-6: the difference is at most 1e-6 of the parameter, or 1e-6 of 1 %
+of its permitted range if that is larger. The column `batched nearer` is the share of the remaining voxels where the
+batched fit is nearer to the minimum. `warnings` is the number of voxels for which the batched fit reports a problem.
 
-With 15 parameters the batched fit starts from two points and keeps the better result. SciPy starts from the first of
-them only.
+With 15 parameters per spectrum, the batched fit of this project starts from two sets of starting values and keeps the
+better result. SciPy starts from the first set only.
 
 {markdown(list(compare_with_scipy(file)), AGREEMENT)}
 
@@ -351,7 +351,7 @@ voxel. This page compares two ways to fit five Lorentzian lines to each spectrum
 and a neural network. It shows how fast and how exact each of them is. `plugins/data/cest/README.md` describes the data
 and the model of the spectra.
 
-The slice has {len(inputs):,} voxels with one spectrum each (`{file.name}`, 7 T, 93 offsets).
+The brain slice has {len(inputs):,} voxels with one spectrum each (`{file.name}`, 7 T, 93 offsets).
 Another {volume.dropped} voxels are left out, because their spectra hold numbers that are not finite. The networks
 were trained on {len(train["input"])} voxels and are tested on {len(test["input"])} other voxels, in separate
 bands of rows. All times are processor times on one core. SciPy means `optimize.least_squares` (trf, bounds,
@@ -364,12 +364,12 @@ twice. The commands are in `cest.py`.
 
 ## Error against run time
 
-The table and the figure hold the errors of the ten amplitudes and widths in held-out voxels. An error is the distance
-from the converged least-squares fit, divided by the standard error of that fit. Only parameters that the data determine
-are counted: the standard error is below {100 * DETERMINED:.0f} % of the permitted range, and the parameter is not at
-the border of this range. `time a voxel` is measured with the whole slice at once, except for SciPy. The column
-`speed ratio to SciPy` is the time of SciPy divided by that of the method. The last column
-is the share of errors below one standard error. For the networks of {len(networks)} seeds this share is
+This table and the figure hold the errors of the ten fitted parameters, five amplitudes and five widths of lines, in
+held-out voxels. An error is the distance from the converged least-squares fit, divided by the standard error of that
+fit. Only parameters that the data determine are counted: the standard error is below {100 * DETERMINED:.0f} % of the
+permitted range, and the parameter is not at the border of this range. `time a voxel` is measured with the whole slice
+at once, except for SciPy. The column `speed ratio to SciPy` is the time of SciPy divided by that of the method. The
+last column is the share of errors below one standard error. For the networks of {len(networks)} seeds this share is
 {" / ".join(f"{100 * share:.1f} %" for share in shares)}. The small errors of least squares are no evidence of
 accuracy, because the targets are themselves least-squares fits.
 
@@ -377,36 +377,40 @@ accuracy, because the targets are themselves least-squares fits.
 
 {markdown(methods, METHODS)}
 
-Each row is one parameter of the spectra. `determined` is the share of voxels whose data determine the parameter.
-`standard error` is the median standard error of least squares, and `network error` is the median absolute error of the
-network; both are in the unit of the parameter. `below standard error` is the share of determined parameters for which
-the network error is smaller than the standard error. These columns are for the first network. The last three columns
-hold the coverage of the predicted 90 % intervals in %, for each of the networks: without calibration, after calibration
-on the validation split, and after calibration on the test split.
+Each row of the table is one parameter of the Lorentzian lines that are fitted to the spectra. `determined` is the
+share of voxels whose data determine the parameter. `standard error` is the median standard error of least squares,
+and `network error` is the median absolute error of the network; both are in the unit of the parameter.
+`below standard error` is the share of determined parameters for which the network error is smaller than the standard
+error. These columns are for the first network. The last three columns hold the coverage of the predicted 90 %
+intervals in %, for each of the networks: without calibration, after calibration on the validation split, and after
+calibration on the test split.
 
 {TABLE_HEAD}
 |---|---|---|---|---|---|---|---|
 {chr(10).join(lines)}
 | all | {determined} | | | | {coverage["before"]} | {coverage["after"]} | {coverage["mixed"]} |
 
-The intervals are calibrated with `conformal` (score=mass) for each parameter separately. The validation split consists
-of other bands of rows with other tissue. Conformal prediction therefore does not guarantee the coverage for the test
-split. For the last column a random half of the test split is used for calibration and the other half for the test.
+The predicted 90 % intervals of the parameters are calibrated with `conformal` (score=mass) for each parameter
+separately. The voxels of the brain slice are split by bands of neighbouring rows. The bands of the validation split
+therefore show other tissue than the bands of the test split, and conformal prediction does not guarantee the coverage
+for the test split. For the last column of the table, a random half of the test split is used for calibration and the
+other half for the test.
 
 ## Predicted uncertainty for unusual spectra
 
-A predicted standard deviation σ should increase if a spectrum is unlike those of the training. For this table the
-held-out spectra were changed: noise with the given standard deviation was added, or the lines were shifted along the
-axis of the offsets. `σ ratio` is the predicted σ divided by that for the unchanged spectra, and `error ratio` is the
-same ratio of the mean absolute errors; both are geometric means. `coverage` is the share of targets in the predicted
-90 % intervals. If σ rises less than the error, the coverage falls.
+The standard deviation σ that the network predicts for a parameter should increase if a spectrum is unlike the
+training spectra. For this table the held-out spectra were changed: noise with the given standard deviation was added,
+or the lines were shifted along the axis of the offsets. `σ ratio` is the predicted σ divided by that for the
+unchanged spectra, and `error ratio` is the same ratio of the mean absolute errors; both are geometric means.
+`coverage` is the share of targets in the predicted 90 % intervals. If σ rises less than the error, the coverage
+falls.
 
 {markdown(changed, CHANGED_SPECTRA)}
 
 ## Maps
 
-The maps show the amplitudes of the lines in the whole slice, as computed by least squares, by the network, and by
-least squares that start from the network.
+The maps in the figure show the amplitudes of the fitted lines in the whole slice, as computed by least squares, by
+the network, and by least squares that start from the network.
 
 ![Maps of the amplitudes](cest_maps.png)
 
