@@ -93,11 +93,11 @@ PARTS = (
     ),
     Part(
         "The thesis says that truncated distances are hardly better than occupancy on grids of 8³ cells, and that "
-        "they lose accuracy if a grid of 32³ cells is replaced by one of 8³ cells. Our 8³ grid is better than our "
-        "32³ grid. A grid of truncated distances holds for each cell the distance to the nearest point of the "
-        "cloud, but at most the edge length of a cell. This limit is four times as long for 8³ cells as for 32³ "
-        "cells. The suspected cause of the lower accuracy of the 32³ grid is its shorter limit. The change is a "
-        "limit of four edge lengths, which is the limit of the 8³ grid.",
+        "they lose accuracy if a grid of 32³ cells is replaced by one of 8³ cells. In our results, the grid of 8³ "
+        "cells is better than the grid of 32³ cells. A grid of truncated distances holds for each cell the distance "
+        "to the nearest point of the cloud, but at most the edge length of a cell. This limit is four times as long "
+        "for 8³ cells as for 32³ cells. The suspected cause of the lower accuracy of the 32³ grid is its shorter "
+        "limit. The change is a limit of four edge lengths, which is the limit of the 8³ grid.",
         "6-30, 6-34",
         "truncation",
         ("experiment=modelnet40/tdf_mlp_32", "encoder.tdf.truncation=4", "seed=0,1,2"),
@@ -175,9 +175,9 @@ PARTS = (
         SPLIT,
     ),
     Part(
-        "The thesis says that boosting is more accurate than extremely randomised trees. In our results it is "
+        "The thesis says that boosting is more accurate than extremely randomised trees. In our results, boosting is "
         "less accurate. The suspected cause is that our boosting has only 50 rounds, each on a fiftieth of the "
-        "features, so that a run takes minutes. The change is 200 rounds.",
+        "features, so that a run takes minutes. The change is 200 rounds of boosting.",
         "6-42",
         "boosting",
         ("experiment=modelnet40/bps_xgboost", "density_head.rounds=200", "seed=0"),
@@ -296,8 +296,9 @@ def main() -> None:
         "of claims it removes a suspected cause of the difference, trains the models again and compares the "
         "results. [claims.md](claims.md) numbers the claims and draws the conclusions. The command of this page "
         "is `python -m reproduction.contradictions`.\n\n"
-        "Each section states the claims, the suspected cause, the change, and the command of the new runs. The "
-        "rows without the change are runs of [the tables of the thesis](thesis_tables.md).\n\n"
+        "Each section of this page states contradicted claims of the thesis, the suspected cause, the change, and "
+        "the command of the new runs. The rows without the change are runs of [the tables of the "
+        "thesis](thesis_tables.md).\n\n"
         + "\n".join(section(part) for part in PARTS)
         + f"\n{machine('torch', 'pytorch-lightning')}\n"
     )

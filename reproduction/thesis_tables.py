@@ -315,10 +315,10 @@ def report(page: str, written: Mapping[str, float]) -> str:
         [
             "# The thesis's tables, run (synthetic data)",
             "",
-            "This page lists which tables and figures of the thesis have been repeated, when, and how long the runs "
-            "took. `python -m reproduction.thesis_tables` makes all of them, and with `--tell` it only prints the "
-            "commands.",
-            "",
+            "This page lists which tables and figures of the thesis have been repeated, when, and how long the "
+            "training runs took. `python -m reproduction.thesis_tables` makes all of them, and with `--tell` it only "
+            "prints the commands. "
+            "The columns of the table mean:",
             "- **Runs, complete** is the number of runs that are complete and the number of runs that the table needs. "
             "Runs that several tables share are counted only in the first of their rows.",
             "- **Minutes of runs** is the time that the runs take if two of them run at the same time on one thread "
@@ -331,7 +331,7 @@ def report(page: str, written: Mapping[str, float]) -> str:
             "|---|---|---|---:|---:|---:|---|",
             *lines,
             "",
-            f"Everything together takes {format_number(total_hours(lines))} hours on two cores, and "
+            f"All runs and pages together take {format_number(total_hours(lines))} hours on two cores, and "
             f"{format_number(total_hours([line for line in lines if not line.startswith(FIGURES)]))} hours without "
             f"Figures 3.7 and 3.8. {machine('torch', 'pytorch-lightning')}",
             "",

@@ -128,7 +128,8 @@ def test_every_claim_has_evidence_a_verdict_and_a_command() -> None:
     apart = "; ".join(
         f"Chapter {key}: {', '.join(str(found[kind]) for kind in kinds)}" for key, found in verdicts.items()
     )
-    assert f"{len(rows)} claims: {total[0]} hold, {total[1]} contradicted, {total[2]} open ({apart})." in text
+    counts = f"{total[0]} hold, {total[1]} are contradicted and {total[2]} are open (in this order, {apart})."
+    assert f"Of {len(rows)} claims, {counts}" in " ".join(text.split())
     linked = re.findall(r"\]\(([^)]*)\)", text)
     assert linked and not [path for path in linked if not (CLAIMS.parent / path).exists()]
 

@@ -169,8 +169,9 @@ def posterior_landscape(seeds: list[int]) -> str:
         )
     sure, unsure, band = np.mean(statistics, 0)
     return (
-        f"The posterior itself has a mean entropy of {sure:.3f} where it is sure and of {unsure:.3f} where it is not, "
-        f"and its share of points with {BAND[0]} < p < {BAND[1]} is {band:.3f}."
+        f"The posterior, which is the true probability of each class, has a mean entropy of {sure:.3f} nats at the "
+        f"test points where it is sure (above {SURE} for one class), and of {unsure:.3f} nats where it is not sure "
+        f"(below {UNSURE} for both). Its share of test points with {BAND[0]} < p < {BAND[1]} is {band:.3f}."
     )
 
 
@@ -184,8 +185,8 @@ def posterior_scores(seeds: list[int]) -> str:
         scores.append((((p > 0.5) == label).mean(), -np.log(true_class).mean(), ((label - p) ** 2).mean()))
     accuracy, nll, brier = np.mean(scores, 0)
     return (
-        "The generator also gives the true probability of each class at a point, the posterior. A perfect model "
-        "would predict it. On the same test points it has these scores: accuracy "
+        "The generator of the two moons also gives the true probability of each class at a point, the posterior. A "
+        "perfect model would predict it. On the 5000 test points, this posterior has these scores: accuracy "
         f"{accuracy:.3f}, NLL {nll:.4f}, Brier {brier:.4f}."
     )
 
@@ -309,10 +310,11 @@ def main() -> None:
         "points in the plane. The points of each class lie along a half circle, and the two half circles, "
         "the two moons, are interleaved. The table shows how accurate and how well calibrated each method is, and "
         "whether it recognises outliers.\n\n"
-        f"The command is `python -m reproduction.thesis_tables 2.1`. It made {len(rows)} runs in {minutes:.0f} "
-        "processor minutes. The seed of a run determines its training data and its initial weights. All methods with "
-        "the same seed have the same data and the same 5000 test points. A cell holds the mean over seeds and, after "
-        "±, the standard deviation over seeds.\n\n"
+        f"The command that repeats Table 2.1 is `python -m reproduction.thesis_tables 2.1`. It made {len(rows)} runs "
+        f"in {minutes:.0f} processor minutes. The seed of a run determines its training data and its initial weights. "
+        "All methods with the same seed have the same data and the same 5000 test points. A cell of the table holds "
+        "the mean over seeds and, after ±, the standard deviation over seeds. "
+        "The rows and columns of the table are:\n"
         "- **vanilla, 128** and **vanilla, 512** are one network without any method, with that many units in each "
         "hidden layer. All other rows use networks of 512 units.\n"
         "- **NLL** is the mean negative log-likelihood of the true class, in nats. **Brier** is the mean squared "
@@ -323,24 +325,24 @@ def main() -> None:
         "**AUROC** is the probability that an outlier has a higher entropy than a test point.\n"
         "- **ms / sample** is the time of one prediction in a batch of 100, measured on one thread while no other "
         "model runs. The processor time is that of the whole run.\n\n"
-        "The number of epochs, the batch size and the learning rate were chosen such that the two vanilla networks "
-        "overfit as in the thesis. The last row combines several methods. Its settings were chosen on other data of "
-        "the same generator. An earlier combination (5 networks, no dropout, weight λ = 1 of outlier exposure) "
-        "had been compared with the other rows on the test split. Its Brier score was worse than the best by "
-        "0.0002, and its OOD entropy by 0.002.\n\n"
+        "The number of epochs, the batch size and the learning rate of all methods were chosen such that the two "
+        "vanilla networks (128 and 512 units per layer) overfit as in the thesis. The last row of the table combines "
+        "several methods. Its settings were chosen on other data of the same generator. An earlier combination (5 "
+        "networks, no dropout, weight λ = 1 of outlier exposure) had been compared with the other rows on the test "
+        "split. Its Brier score was worse than the best by 0.0002, and its OOD entropy by 0.002.\n\n"
         f"{markdown(compared, COLUMNS, better=BETTER)}\n\n{posterior_scores(seeds)}\n\n"
         "## What Figure 2.3 shows, in numbers\n\n"
-        "Figure 2.3 of the thesis shows the predicted probability p of class 1 over the plane. The next table "
-        "describes the same predictions by three numbers. The first is the mean entropy of the predictions at the test "
-        "points where the posterior is sure, that is, where one class has a true probability above "
-        f"{SURE}. The second is the mean entropy at the test points where the posterior is not sure, that is, where "
-        f"both classes have a true probability below {UNSURE}. The third is the share of test points with 0.1 < p "
-        "< 0.9; a larger share means a softer boundary between the classes.\n\n"
+        "Figure 2.3 of the thesis shows the probability p of class 1 that each method predicts over the plane of the "
+        "two moons. The next table describes these predictions by three numbers. The first is the mean entropy of "
+        "the predictions at the test points where the posterior is sure, that is, where one class has a true "
+        f"probability above {SURE}. The second is the mean entropy at the test points where the posterior is not "
+        f"sure, that is, where both classes have a true probability below {UNSURE}. The third is the share of test "
+        "points with 0.1 < p < 0.9; a larger share means a softer boundary between the classes.\n\n"
         f"{markdown(compared, LANDSCAPE_COLUMNS)}\n\n{posterior_landscape(seeds)}\n\n"
         "## Comparisons of two methods\n\n"
-        "Each row tests one claim by comparing two methods on the same data and seeds. The difference is that of the "
-        "first method minus "
-        "the second, as mean ± standard deviation over seeds. The last column counts the seeds that agree with the "
+        "Each row of the table tests one claim of the thesis by comparing two methods of uncertainty estimation on "
+        "the same data and seeds. The difference is the result of the first method minus that of the second, as mean "
+        "± standard deviation over seeds. The last column counts the seeds that agree with the "
         f"claim.\n\n{claims_table(rows)}\n\n"
         "## Table 2.1 as printed in the thesis\n\n"
         "The thesis generated its own two moons, so these values can be compared with ours only in their "

@@ -64,8 +64,9 @@ def class_mean_section(rows: list[dict[str, Any]]) -> str:
     lines = [
         f"## Mean of {len(classes)} classes",
         "",
-        "This table holds the methods that were trained on every class. The numbers are means over classes. Brackets "
-        "hold the mean difference from `fixed_kappa` on the same class, ± its standard error over classes.",
+        "This table holds the density heads that were trained on every class of objects. The numbers are means over "
+        "classes. Brackets hold the mean difference from `fixed_kappa` on the same class, ± its standard error over "
+        "classes.",
         "",
         "| method | log-likelihood (nats) | Acc π/6 | MedErr ° | thesis, real PASCAL3D+: the same three columns |",
         "|---|---:|---:|---:|---|",
@@ -116,10 +117,10 @@ def main() -> None:
         "This page repeats Table 3.3 of the thesis: networks predict the viewpoint of an object, that is its azimuth, "
         "elevation and tilt. The images are generated in the layout of PASCAL3D+. Five density heads are compared on "
         "the same encoder.\n\n"
-        f"The images are crops of {size} pixels. The encoder is `biternion_vgg`, trained for {epochs} epochs in "
-        f"batches of {batch}. The text at the top of `pascal3d.py` lists the commands that train the models. ± is "
-        "the standard deviation over seeds, "
-        "or the standard error over the test set if there is one seed.\n\n"
+        f"The input images are crops of objects, {size} × {size} pixels in size. The encoder is `biternion_vgg`, "
+        f"trained for {epochs} epochs in batches of {batch}. The text at the top of `pascal3d.py` lists the commands "
+        "that train the models. In the tables, ± is the standard deviation over seeds, or the standard error over "
+        "the test set if there is one seed. The terms in the tables mean:\n"
         "- **Methods**: `fixed_kappa` is a von Mises density with one concentration κ for all images, and "
         "`von_mises` one with a predicted κ. `mixture` is a finite mixture of von Mises densities. `cvae` is a "
         "conditional variational autoencoder, and `scvae` its simplified form, whose latent variable does not "
@@ -132,7 +133,8 @@ def main() -> None:
         "- **Gap to uniform** is for `bottle`, which looks the same from every side. It is the difference between "
         "log 2π, the entropy of the uniform density, and the azimuth entropy; 0 is best.\n\n"
         f"{markdown(compared, COLUMNS)}\n\n{class_mean_section(rows)}\n\n"
-        f"The table summarises {len(rows)} runs on {threads} each. {machine('torch', 'pytorch-lightning')}\n"
+        f"The tables of this page summarise {len(rows)} runs on {threads} each. "
+        f"{machine('torch', 'pytorch-lightning')}\n"
     )
     publish(__file__, text)
 

@@ -325,12 +325,12 @@ def write_results(
     """Write the page, the CSV file and both figures."""
     text = [
         "# Predicted ball flights: error against time", "",
-        "This page repeats Figure 4.3 of the thesis: four methods observe a table tennis ball for some frames and "
+        "This page repeats Figure 4.3 of the thesis: four methods observe a table-tennis ball for some frames and "
         "predict its further flight. They are a physical model, a trajectory variational autoencoder (TVAE), a "
         "recurrent network (LSTM) and a hybrid of physics and network. The flights are either simulated or recorded "
-        "with the cameras of "
-        "a laboratory.", "",
+        "with the cameras of a laboratory.", "",
         "![Error against time](ball_flights.png)", "",
+        "The columns of the tables of predicted ball flights are:",
         "- **Error at 16 ms** and so on is the mean distance in cm between the predicted and the true position of "
         "the ball, 16 ms (and so on) after the last observed frame. **Mean error** averages over all predicted frames.",
         "- **Coverage before** and **coverage after** are the share in % of recorded coordinates that lie within the "
@@ -343,33 +343,38 @@ def write_results(
         "The data are 4,000 simulated flights. Each method is trained with one seed and tested on "
         f"{MOST_WINDOWS:,} windows.", "",
         *error_table(simulated), "",
-        "The error is measured against the simulated flight without noise. The physical model has the form of the "
-        "simulator, and its constants are estimated from the training windows. The TVAE contains no physics; it "
-        "falls behind the physical model most where the ball has just bounced.", "",
-        f"The error of the TVAE divided by that of physics is {error_ratios(simulated, 'tvae')}.", "",
-        f"The error of the hybrid divided by that of physics is {error_ratios(simulated, 'hybrid')}.", "",
+        "For simulated flights, the error of a predicted flight is measured against the simulated flight without "
+        "noise. The physical model has the form of the simulator, and its constants are estimated from the training "
+        "windows. The TVAE contains no physics; it falls behind the physical model most where the ball has just "
+        "bounced.", "",
+        "For simulated flights, the error of the TVAE divided by that of the physical model is "
+        f"{error_ratios(simulated, 'tvae')}.", "",
+        "For simulated flights, the error of the hybrid divided by that of the physical model is "
+        f"{error_ratios(simulated, 'hybrid')}.", "",
         "The next figure shows 30 sampled flights for each of three windows, and the places where all sampled flights "
         "land.", "",
         "![Sampled flights and landing places](ball_flights_bundle.png)", "",
-        "A flight begins at the last observed position of the ball, so it may land before the first predicted frame. "
-        "The ellipses of the learned densities hold fewer than 90 % of the true landing places.", "",
+        "For the landing place, a predicted flight begins at the last observed position of the ball, so it may land "
+        "before the first predicted frame. The ellipses that hold 90 % of the sampled landing places of TVAE, LSTM "
+        "and hybrid contain fewer than 90 % of the true landing places.", "",
     ]  # fmt: skip
     if recorded:
         text += [
             "## Recorded flights", "",
-            "Of 82 recorded flights, 40 are long enough: 28 are for training, 4 for validation and 8 for the test. "
-            f"Each method is trained with {len(SEEDS)} seeds, and the seed also determines the split.", "",
+            "Of 82 recorded flights of a table-tennis ball, 40 are long enough: 28 are for training, 4 for "
+            f"validation and 8 for the test. Each method is trained with {len(SEEDS)} seeds, and the seed also "
+            "determines the split.", "",
             *error_table(recorded), "",
-            "The networks start from the weights that were trained on simulated flights. The LSTM and the hybrid are "
-            f"then trained for {EPOCHS['lstm']} epochs of three steps, the TVAE for {EPOCHS['tvae']}. The physical "
-            "model estimates its constants from the training windows. The error is measured against the recorded "
-            "positions, which contain noise.", "", nearest_text, "",
+            "On recorded flights, the training of the networks starts from the weights that were trained on "
+            f"simulated flights. The LSTM and the hybrid are then trained for {EPOCHS['lstm']} epochs of three steps, "
+            f"the TVAE for {EPOCHS['tvae']}. The physical model estimates its constants from the training windows. "
+            "The error is measured against the recorded positions, which contain noise.", "", nearest_text, "",
         ]  # fmt: skip
     text += [
         "## Latency", "",
-        "The table shows the median time of one prediction with 30 sampled flights, on one core, for the frozen model "
-        "and for the model in torch. The last column is the largest relative difference between the point predictions "
-        "of the two forms; the inputs include extreme values.", "",
+        "The table shows the median time of one prediction of a flight with 30 sampled flights, on one core, for the "
+        "frozen model and for the model in torch. The last column is the largest relative difference between the "
+        "point predictions of the two forms; the inputs include extreme values.", "",
         "| method | frozen, ms | torch, ms | largest relative difference |", "|---|---|---|---|", *latencies, "",
         f"{machine('torch', 'numpy')} One thread. Command: `python -m reproduction.chapter4.ball_flights <folder>`.",
     ]  # fmt: skip

@@ -125,20 +125,20 @@ def main(runs: list[Path], scan: Path | None) -> None:
     lines = [
         "# Table 6.4, and the run time of registration",
         "",
-        "A network predicts the vertices of a registered body mesh from the point cloud of a scan. This page measures "
-        "the run time of each step, the error of the registered meshes, and the correspondences of Table 6.4 of the "
-        "thesis.",
+        "A network predicts the vertices of a registered body mesh from the point cloud of a scan. This page "
+        "measures the run time of each step of the registration, the error of the registered meshes, and the "
+        "correspondences of Table 6.4 of the thesis.",
         "",
         machine("torch", "numba"),
         "",
-        "The bodies come from the default body model. Its vertices differ by at most "
-        f"{1e6 * traits.largest_error:.2g} µm from those of its original package, for 8 bodies of random shape and "
-        "pose, in float32 compared with float64.",
+        "The bodies on this page come from the default body model of the project. The computed vertices of this "
+        f"model differ by at most {1e6 * traits.largest_error:.2g} µm from those of its original package, for 8 "
+        "bodies of random shape and pose, in float32 compared with float64.",
         "",
         "## Run time of each step",
         "",
-        'The table shows the median processor time in milliseconds on one core. "Forward" is the network alone; its '
-        "last layer is a product of two matrices of the given rank.",
+        "The table shows the median processor time of each step of the registration of a scan, in milliseconds on "
+        'one core. "Forward" is the network alone; its last layer is a product of two matrices of the given rank.',
         "",
         "| step, on one core | ms |",
         "|---|---:|",
@@ -148,11 +148,10 @@ def main(runs: list[Path], scan: Path | None) -> None:
         "",
         "## Error that the rank of the last layer makes unavoidable",
         "",
-        "The last layer of the network is a product of two matrices, whose rank limits the meshes that the network can "
-        f"predict. For each rank, the table shows the mean vertex error of {TEST_BODIES} test bodies (synthetic) after "
-        f"they are projected onto the same number of principal components of {TRAIN_BODIES} training bodies. A last "
-        f"layer "
-        "of this rank cannot be expected to have a smaller error.",
+        "The last layer of the registration network is a product of two matrices, whose rank limits the meshes that "
+        f"the network can predict. For each rank, the table shows the mean vertex error of {TEST_BODIES} test bodies "
+        f"(synthetic) after they are projected onto the same number of principal components of {TRAIN_BODIES} "
+        "training bodies. A last layer of this rank cannot be expected to have a smaller error.",
         "",
         "| rank | vertex error, cm |",
         "|---:|---:|",
@@ -185,8 +184,8 @@ def report_run(run: Path, split) -> list[str]:
         f"The run of `experiment={numbers['experiment']}` took {minutes} minutes with threads={threads}, including the "
         f"computation of its features. The loaded model takes {vertices:.2f} ms on one core from a cloud of "
         f"{cloud.shape[1]} points to the density of all vertices and its median. The table shows the vertex error for "
-        "test bodies (synthetic): mean ± standard error over scans, median, and 95th percentile. Scans are whole, "
-        "partial, or contain outliers.",
+        "test bodies (synthetic): mean ± standard error over scans, median, and 95th percentile. The rows of the "
+        "table are for scans that are whole, partial, or contain outliers.",
         "",
         "| scans | mean error, cm | median error, cm | 95th percentile, cm |",
         "|---|---:|---:|---:|",
@@ -223,16 +222,17 @@ def correspondence_table(runs: list[Path]) -> list[str]:
     return [
         "## Table 6.4: correspondences (synthetic data)",
         "",
-        "The people are generated in the layout of FAUST (`data=faust`). No model was trained on these people or "
-        "poses, and the scans are read from files. In the challenge `intra` a pair shows one person in two poses, in "
-        "`inter` two people. The model registers a mesh to both scans. Each vertex of the true registration of the "
-        "first scan is mapped to the second scan through these two meshes, which have the same topology. The "
-        "error is the mean distance in centimetres between the position that is found and the true position. ± is "
-        "the standard error over pairs; the pairs share scans and people.",
+        "For the correspondences of Table 6.4, people are generated in the layout of FAUST (`data=faust`). No "
+        "network was trained on these people or poses, and the scans are read from files. In the challenge `intra` a "
+        "pair shows one person in two poses, in `inter` two people. The model registers a mesh to both scans. Each "
+        "vertex of the true registration of the first scan is mapped to the second scan through these two meshes, "
+        "which have the same topology. The error is the mean distance in centimetres between the position that is "
+        "found and the true position. ± is the standard error over pairs; the pairs share scans and people.",
         "",
-        "`registration/quick` was trained on thousands of generated bodies, and `faust/registration` only on the "
-        "70 training scans in this layout. The errors of the thesis are for the real scans of FAUST and another body "
-        f"model. Reading, encoding and registering a scan takes {1e3 * middle(seconds):.0f} ms on one core.",
+        "The network of `experiment=registration/quick` was trained on thousands of generated bodies. The network of "
+        "`experiment=faust/registration` was trained only on the 70 generated training scans in the layout of FAUST. "
+        "The errors of the thesis are for the real scans of FAUST and another body model. To read, encode and "
+        f"register a scan takes {1e3 * middle(seconds):.0f} ms on one core.",
         "",
         "| training run | challenge | pairs | mean error, cm | error of the worst pair, cm | mean error in the thesis "
         "(real FAUST), cm |",

@@ -49,11 +49,11 @@ ERROR_FACTOR = 3
 NAMES = {"quick": "SMPLpix", "hybrid": "network over the mesh"}
 """Names of runs by experiment; other runs keep the name of their experiment."""
 ABOUT = (
-    "The people are generated. An image has {height} × {width} pixels, and the mesh has {vertices:,} coloured vertices "
-    "and is drawn with 4 × 4 samples per pixel. For other poses, the mesh that is registered to the first scan is "
-    "posed, and the clothed person is photographed in that pose. Other shapes have no photograph, because clothes "
-    f"would fall differently on them. The last rows of a figure show the errors, enlarged {ERROR_FACTOR} times. PSNR "
-    "is the peak signal-to-noise ratio over the whole frame."
+    "The people in the figures are generated. An image has {height} × {width} pixels, and the mesh has {vertices:,} "
+    "coloured vertices and is drawn with 4 × 4 samples per pixel. For other poses, the mesh that is registered to the "
+    "first scan is posed, and the clothed person is photographed in that pose. Other shapes have no photograph, "
+    "because clothes would fall differently on them. The last rows of a figure show the errors, enlarged "
+    f"{ERROR_FACTOR} times. PSNR is the peak signal-to-noise ratio over the whole frame."
 )
 
 
@@ -114,13 +114,12 @@ def main(runs: Sequence[str]) -> None:
         "# Qualitative results of SMPLpix, as in Figures 7.2 to 7.5 (synthetic people)",
         "",
         "This page shows qualitative results as in Figures 7.2 to 7.5 of the thesis: images of people who are not in "
-        "the training data. Each figure compares the projected points, the drawn mesh, the networks and the "
-        "photograph.",
+        "the training data. Each figure compares the projected vertices of a mesh, the drawn mesh, the networks and "
+        "the photograph.",
         "",
         about,
         "",
-        "The networks were trained as follows:",
-        "",
+        "The networks in the figures were trained as follows:",
         *trained,
         "",
         *lines,

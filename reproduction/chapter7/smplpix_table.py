@@ -175,11 +175,11 @@ def report(folders: Sequence[Path], lpips: str | None) -> str:
             "neural network from projected vertices (SMPLpix) or from the drawn mesh. The table compares the images "
             f"with photographs, and gives the run time. {data_text}",
             "",
-            "A cell of a quality column holds the mean over test images ± the standard deviation over seeds ± the "
-            "standard deviation over subjects. The value of a subject is the mean over its images and seeds. A dash "
-            "stands for the standard deviation over seeds of methods that are not trained, because all seeds "
-            "give the same numbers.",
-            "",
+            "In the table, a cell of a quality column (PSNR, SSIM and others) holds the mean over test images ± the "
+            "standard deviation over seeds ± the standard deviation over subjects. The value of a subject is the "
+            "mean over its images and seeds. A dash stands for the standard deviation over seeds of methods that are "
+            "not trained, because all seeds give the same numbers. "
+            "The terms in the table mean:",
             "- **Vertices** is the number of vertices of the mesh: 6,890 (7k) or about 27,000 (27k).",
             "- **Inside** means that only the pixels of the subject count. The other columns are over the whole frame, "
             "most of which is white.",
@@ -187,7 +187,7 @@ def report(folders: Sequence[Path], lpips: str | None) -> str:
             'image on one thread. A mesh is drawn with 4 × 4 samples per pixel; "supersampling 1" has one sample. '
             "**Network** is the processor time of the network.",
             "",
-            "The networks are trained for a quarter of the epochs of the experiments. "
+            "The rendering networks are trained for a quarter of the epochs of the experiments. "
             "[smplpix_training.md](smplpix_training.md) shows what longer training brings. The sweeps are "
             f"{sweep_commands}.{unfinished_note(runs)}",
             "",
@@ -198,10 +198,10 @@ def report(folders: Sequence[Path], lpips: str | None) -> str:
             "",
             "## Difference from the mesh with vertex colours",
             "",
-            "Each row is compared with the mesh that has the same number of vertices and colours at its vertices. The "
-            "difference is taken image by image and averaged for each subject. A cell holds the mean difference ± the "
-            "standard deviation over subjects; positive numbers mean better images. The last column counts the "
-            "subjects whose PSNR inside improves.",
+            "Each row of this table compares a rendering method with the drawn mesh that has the same number of "
+            "vertices and colours at its vertices. The difference of the image quality is taken image by image and "
+            "averaged for each subject. A cell holds the mean difference ± the standard deviation over subjects; "
+            "positive numbers mean better images. The last column counts the subjects whose PSNR inside improves.",
             "",
             f"| method | vertices | {' | '.join(COLUMNS[key][0] for key in GAINS)} | subjects with a gain |",
             f"|---|---|{'---:|' * (len(GAINS) + 1)}",
@@ -209,10 +209,10 @@ def report(folders: Sequence[Path], lpips: str | None) -> str:
             "",
             "## Table 7.1 as printed in the thesis",
             "",
-            "The thesis used other data: photographs of 68 unseen real people in a scanner, with 410 × 308 pixels, "
-            "which are not public. Its mesh renderer (Kato et al. 2018, without anti-aliasing), its network and its "
-            "machine were also different. Only the order of the rows can therefore be compared with the table above, "
-            "not the numbers.",
+            "For Table 7.1, the thesis used other data: photographs of 68 unseen real people in a scanner, with 410 "
+            "× 308 pixels, which are not public. Its mesh renderer (Kato et al. 2018, without anti-aliasing), its "
+            "network and its machine were also different. Only the order of the rows can therefore be compared with "
+            "the table above, not the numbers.",
             "",
             "| method | vertices | PSNR, dB | LPIPS | run time, ms |",
             "|---|---|---:|---:|---:|",

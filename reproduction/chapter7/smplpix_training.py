@@ -281,27 +281,31 @@ def report(rows: Record) -> str:
             "frame, or inside, that is over the pixels of the subject. ± is the standard deviation over seeds, if "
             "there are several.",
             "",
-            "Each row with another number of epochs is a separate training run, because the learning rate falls to "
-            "0 at the end of a training. The minutes are the number of epochs multiplied by the time of the "
-            "shortest epoch, on one core.",
+            "Each row of the table with another number of epochs is a separate training run of a rendering network, "
+            "because the learning rate falls to 0 at the end of a training. The minutes are the number of epochs "
+            "multiplied by the time of the shortest epoch, on one core.",
             "",
             f"![Quality against minutes of training]({HERE.stem}.png)",
             "",
             *header,
             *lines(worn=False),
             "",
+            "The following list says after how many minutes of training the images of a network are better than a "
+            "drawn mesh:",
             *crossings,
             "",
             f"![Photographs, images and errors]({HERE.stem}_people.png)",
             "",
-            "The columns of the figure are, from the left: the photograph, the mesh, the network on points alone and "
-            "the network over the mesh (20 epochs each), and then the error of these three images.",
+            "The figure shows people who are not in the training data. Its columns are, from the left: the "
+            "photograph, the drawn mesh, the network on points alone and the network over the mesh (20 epochs each), "
+            "and then the error of these three images.",
             "",
             *([f"## {SKINS}", "", *header, *skins, ""] if skins else []),
             *([f"These combinations were not run: {'; '.join(missing)}.", ""] if missing else []),
             *(
                 [
-                    f"These rows were measured on another machine or another day: {' '.join(other_machines)}",
+                    "These rows of the tables were measured on another machine or another day: "
+                    f"{' '.join(other_machines)}",
                     "",
                 ]
                 if other_machines
