@@ -139,9 +139,9 @@ def main() -> None:
     torch.set_num_threads(1)
     require_idle()
     conditions = (
-        f"All times are processor times of one thread, in float32. A number is the median of {ROUNDS} interleaved "
-        f"rounds (least to largest). {machine('torch', 'numpy', 'numba')} "
-        "Command: `python -m benchmarks.densities.mixtures`."
+        f"All times on this page are processor times of one thread, in float32. A number is the median of {ROUNDS} "
+        f"interleaved rounds (least to largest). {machine('torch', 'numpy', 'numba')} Command: `python -m "
+        "benchmarks.densities.mixtures`."
     )
     write_page(
         __file__,

@@ -362,9 +362,9 @@ def timed_sections() -> dict[str, str]:
     torch.set_num_threads(1)
     require_idle()
     conditions = (
-        "All times are processor times of one thread. The implementations were called in interleaved rounds; a number "
-        f"is the median of {ROUNDS} rounds (least to largest). {machine('torch', 'numpy', 'scipy')} "
-        "Command: `python -m benchmarks.densities.von_mises --only times`."
+        "All times in this section are processor times of one thread. The compared implementations were called in "
+        f"interleaved rounds; a number is the median of {ROUNDS} rounds (least to largest). "
+        f"{machine('torch', 'numpy', 'scipy')} Command: `python -m benchmarks.densities.von_mises --only times`."
     )
     return {
         heading: "\n".join([*([before, ""] if before else []), *lines(), "", conditions])

@@ -215,10 +215,10 @@ def report() -> None:
         "descent may restart at most once.",
         "",
         "In the table, `samples a pixel` is the number of samples with which the descent renders its images. "
-        "`images` is the number of images to which the body was fitted. There are 100 images, and a smaller number "
-        "means the first ones of them. `fits within 2° and 1 cm` counts the fits whose rotation error is at most 2° "
-        "and whose translation error is at most 1 cm. The following columns hold the median, the 95 % quantile and "
-        "the largest value of both errors. The last two columns hold the processor time of a fit.",
+        "`images` is the number of images to which the body was fitted. There are 100 images; if the number is "
+        "smaller, the first of these images were used. `fits within 2° and 1 cm` counts the fits whose rotation "
+        "error is at most 2° and whose translation error is at most 1 cm. The following columns hold the median, the "
+        "95 % quantile and the largest value of both errors. The last two columns hold the processor time of a fit.",
         "",
         *table(results),
         "",

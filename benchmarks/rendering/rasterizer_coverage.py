@@ -82,9 +82,10 @@ def report() -> str:
             f"The count took {seconds:.0f} s.",
             "",
             f"The second test of the coverage draws a closed body of 27,554 vertices in {VIEWS} views of {HEIGHT} × "
-            f"{WIDTH} pixels. It covers {covered:,} pixels and has {holes} holes. Then the faces seen from behind are "
-            f"left out, and {cracks} pixels show another face than before. Such a pixel would be a crack between two "
-            "faces. Pixels at the outline and their neighbours are not counted.",
+            f"{WIDTH} pixels. In all views together, the body covers {covered:,} pixels, and {holes} pixels inside it "
+            f"are not covered (holes). Then the faces seen from behind are left out, and {cracks} pixels show another "
+            "face than before. Such a pixel would be a crack between two faces. Pixels at the outline and their "
+            "neighbours are not counted.",
             "",
             f"{machine('numba', 'numpy')} Command: `python -m benchmarks.rendering.rasterizer_coverage`.",
             "",

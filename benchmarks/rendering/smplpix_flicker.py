@@ -157,8 +157,8 @@ def rates(run: str, scene: Scene) -> list[str]:
         for name, times in times_by_name.items()
     ]
     return [
-        "This table holds the processor time to compute one image in a loop on one thread. The last row is the wall "
-        "time that the training run measured at its end.",
+        "This table holds the processor time to compute one image in a loop on one thread. The last row of the table "
+        "is the wall time of an image that the training run measured at its end.",
         "",
         "| way to predict | median, ms | shortest, ms |",
         "|---|---|---|",

@@ -78,7 +78,7 @@ def main() -> None:
         "| settings of the renderer | time, ms | speed ratio |\n|---|---:|---:|\n"
         + "\n".join(lines)
         + "\n\nThe first row of the table is the default setting of the renderer `smplpix`. In this run it computed "
-        f"in {fast}, and the project requires at most {MOST:g} ms for bfloat16: "
+        f"in {fast}. The project requires at most {MOST:g} ms for an image in bfloat16: "
         f"{'met' if median <= MOST else '**not met**'}. By default the renderer uses bfloat16 if the processor "
         "computes it faster than float32, and if sRGB colours of a test image then change by at most "
         f"{255 * LARGEST_CHANGE:g}/255, and by at most {255 * MEAN_CHANGE:g}/255 on average. The changes of trained "

@@ -265,7 +265,7 @@ rounds (least to largest). In each round SciPy fits another fifth of the voxels 
 voxels with 1e-8, and the batched fit has all voxels. A speed ratio is SciPy's time divided by that of the batched
 fit. `whole slice` is the time of the batched fit for all voxels.
 
-The last five columns compare the results of the batched fit with those of SciPy at the tolerance 1e-14.
+The last five columns of the table compare the batched fits of the spectra with those of SciPy at the tolerance 1e-14.
 `sum of squares ≤ SciPy's` is the share of voxels where the batched fit is at least as good. `same minimum` is the
 share of voxels where the parameters are well determined and both sums of squares agree. `parameters agree` is the
 share of these where every parameter agrees to 1e-6: the difference is at most 1e-6 of the parameter, or 1e-6 of 1 %

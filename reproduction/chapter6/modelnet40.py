@@ -447,8 +447,8 @@ def main() -> None:
         "comparison is held if this number is above 2, contradicted if it is below -2, and otherwise open. A claim "
         "is held if all its comparisons are held, and contradicted if at least one of them is contradicted.\n\n"
         f"{claims_table(methods)}\n\n"
-        f"{len(rows)} runs took {sum(row['seconds'] for row in rows) / 3600:.1f} hours of one core. "
-        f"{machine('torch', 'pytorch-lightning', 'scikit-learn', *boosting)}\n"
+        f"The {len(rows)} training runs of this page took {sum(row['seconds'] for row in rows) / 3600:.1f} hours on "
+        f"one core. {machine('torch', 'pytorch-lightning', 'scikit-learn', *boosting)}\n"
     )
     publish(__file__, text)
 

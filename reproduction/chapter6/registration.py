@@ -181,11 +181,11 @@ def report_run(run: Path, split) -> list[str]:
     return [
         "## Error of a trained model",
         "",
-        f"The run of `experiment={numbers['experiment']}` took {minutes} minutes with threads={threads}, including the "
-        f"computation of its features. The loaded model takes {vertices:.2f} ms on one core from a cloud of "
-        f"{cloud.shape[1]} points to the density of all vertices and its median. The table shows the vertex error for "
-        "test bodies (synthetic): mean ± standard error over scans, median, and 95th percentile. The rows of the "
-        "table are for scans that are whole, partial, or contain outliers.",
+        f"The training run of `experiment={numbers['experiment']}` took {minutes} minutes with threads={threads}, "
+        f"including the computation of its features. The loaded model takes {vertices:.2f} ms on one core from a "
+        f"cloud of {cloud.shape[1]} points to the density of all vertices and its median. The table shows the vertex "
+        "error for test bodies (synthetic): mean ± standard error over scans, median, and 95th percentile. The rows "
+        "of the table are for scans that are whole, partial, or contain outliers.",
         "",
         "| scans | mean error, cm | median error, cm | 95th percentile, cm |",
         "|---|---:|---:|---:|",
