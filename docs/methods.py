@@ -25,9 +25,10 @@ HEADINGS = {
 }
 INTRODUCTION = """# Methods
 
-This page lists every plugin of the project under the name that a command uses for it. `python -m framework
-mode=plugins` prints the same list, and also the plugins of other installed packages. Each name links to the README of
-the plugin's folder, which states its parameters, sources and limits. `python docs/methods.py` writes this page.
+This page lists every plugin of the project under the name that a command uses for it.
+`python -m framework mode=plugins` prints the same list, and also the plugins of other installed packages. Each name
+links to the README of the plugin's folder, which states its parameters, sources and limits. `python docs/methods.py`
+writes this page.
 """
 
 

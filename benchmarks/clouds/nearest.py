@@ -319,7 +319,7 @@ def report() -> str:
             "The table compares the search of this project (`ours`) with the library pykdtree on clouds that are "
             "difficult for search structures. Each cloud has 100,000 points, and there are 1,000 basis points. The "
             "time is the shortest processor time of four calls. The table also gives the largest absolute difference "
-            "between a distance of `ours` and the distance that SciPy computes in float64.",
+            "between a distance that `ours` computes and the distance that SciPy computes in float64.",
             "",
             hard,
             "",

@@ -52,11 +52,11 @@ KINDS = {
 }
 """Data sets, each with the folder of its plugin and the settings of the model."""
 WITHOUT_WARM_UP = (
-    "The server makes a few predictions before it accepts requests, so that the first request is not slow. Without "
-    "this warm-up the first request took 52.5, 94.2 and 508.0 ms for the three data sets, in the order of the rows "
-    "of the table. Later requests took 14.3, 15.1 and 15.7 ms. The ratios were 3.7, 6.2 and 32.4. These numbers were "
-    "measured on 2026-11-25 with the same command on the last commit without the warm-up. Other work ran on the "
-    "machine at the same time."
+    "The server of a model makes a few predictions before it accepts requests, so that the first request is not "
+    "slow. Without this warm-up the first request took 52.5, 94.2 and 508.0 ms for the three data sets, in the order "
+    "of the rows of the table. Later requests took 14.3, 15.1 and 15.7 ms. The ratios were 3.7, 6.2 and 32.4. These "
+    "numbers were measured on 2026-11-25 with the same command on the last commit without the warm-up. Other work "
+    "ran on the machine at the same time."
 )
 
 
@@ -136,11 +136,11 @@ def main() -> None:
         "This page compares the time that a served model needs for its first request and for later requests. The "
         "server is the one that `mlflow models serve` starts. A slow first request would delay the first user after "
         "every start.\n\n"
-        f"To measure the response times, the server is started {STARTS} times for each data set, with a small model "
-        "that was trained on generated data. Each request sends one file. The column `start` is the time from the "
-        "start of the server until it accepts connections. `first request` is the response time of the first "
-        f"request. `later requests` is the median response time of {LATER} further requests. All three are medians "
-        f"over the {STARTS} starts. `ratio` is the time of the first request divided by that of the later "
+        f"To measure the response times, the server of `mlflow models serve` is started {STARTS} times for each data "
+        "set, with a small model that was trained on generated data. Each request sends one file. The column `start` "
+        "is the time from the start of the server until it accepts connections. `first request` is the response time "
+        f"of the first request. `later requests` is the median response time of {LATER} further requests. All three "
+        f"are medians over the {STARTS} starts. `ratio` is the time of the first request divided by that of the later "
         "requests.\n\n"
         "| data | start, s | first request, ms | later requests, ms | ratio |\n|---|---|---|---|---|\n"
     )

@@ -153,10 +153,9 @@ def main(runs: list[str]) -> None:
         "# Quality of an image against its run time (synthetic people)",
         "",
         "This page shows how the quality of an image of an unseen person depends on its run time. Meshes are drawn "
-        "with one to four samples per pixel along each axis, and the network over the mesh (`hybrid`) computes in "
-        "float32 or bfloat16. The quality is measured against photographs as a mean over subjects. "
-        f"{about} "
-        "The terms in the table mean:",
+        "with one to four samples per pixel along each axis, and the network that improves a drawn mesh (`hybrid`) "
+        "computes in float32 or bfloat16. The quality is measured against photographs as a mean over subjects. "
+        f"{about} The terms in the table mean:",
         "- **Samples** is the number of samples per pixel along each axis with which a mesh is drawn.",
         "- **Inside** means that only the pixels of the subject count; the other columns are over the whole frame.",
         "- **Distance in random features** compares the features of an untrained network (objective "
