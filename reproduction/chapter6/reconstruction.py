@@ -228,8 +228,9 @@ def claims_text(rows: list[dict[str, object]]) -> str:
     counts = ", ".join(f"{name} at {best.count(name)} of {len(best)} lengths" for name in sorted(set(best)))
     return (
         f"{markdown(compared, {'length': 'N', **headings})}\n\n"
-        "The reconstruction error of basis points is less than half of that of the occupancy grid for "
-        f"{'; '.join(parts)}. The arrangement of basis points with the smallest error: {counts}."
+        "The list shows for each arrangement of basis points at which lengths N its reconstruction error is less "
+        f"than half of that of the occupancy grid: {'; '.join(parts)}. The arrangement with the smallest error is "
+        f"{counts}."
     )
 
 
