@@ -166,8 +166,8 @@ a maximum influence the result. The column names say whether these "attaining po
 layers with a gradient. The page is written by `python -m benchmarks.clouds.set_steps`.
 
 A training step is the forward and the backward pass of {BATCH} clouds (synthetic CAD models) in float32 on one
-thread. The step is measured after {TRAINED} steps of training. Both methods run in each of {ROUNDS} interleaved
-rounds. The columns are:
+thread. The step is measured after {TRAINED} steps of training. Steps with "every point" and with the "attaining
+points" run in each of {ROUNDS} interleaved rounds. The columns are:
 - ms: processor time of a training step, median over the rounds;
 - time ratio: processor time of a step in which every point has a gradient, divided by that of a step in which only
   the points that attain a maximum have one, median over the rounds;

@@ -197,9 +197,9 @@ With the name of a section (`start`, `training`, `reals` or `angles`) it measure
 START_TEXT = {
     "start": """This section measures how long the commands `mode=predict` and `mode=encode` take to start. They do
 little else: `predict` predicts two rows of a table, and `encode` encodes one point cloud. The first two rows of the
-results are lower bounds: PyTorch alone, and a script that only loads the model. The wanted value is 2.3 s for both
-commands. `encode` misses it: the normalisation of clouds is compiled code, which needs numba, and the import of numba
-with its parts of SciPy takes the rest.
+results are lower bounds: PyTorch alone, and a script that only loads the model. The project wants at most 2.3 s of
+processor time for each of the two commands. `encode` takes longer: the normalisation of clouds is compiled code, which
+needs numba, and the import of numba with its parts of SciPy takes the rest.
 """,
     "training": """This section measures how long training and testing take to start. `train` (`mode=train`) trains a
 small network for three epochs on 2,000 rows of a table and tests it, and `test` (`mode=test`) tests it on 300 rows.
@@ -210,14 +210,14 @@ ROWS_TEXT = {
     "reals": """The table shows the time of `mode=predict` for 100,000 rows. The model predicts one real number with a
 normal density from six columns, in blocks of 64 rows. The interval has the probability 0.9, and its ends are exact. For
 comparison, a bare loop loads the model, reads the table with NumPy, and predicts the mode of the same blocks. It
-computes no entropy and writes nothing. The wanted value is 4 s with intervals. All times include the start of the
-command.
+computes no entropy and writes nothing. The project wants at most 4 s with intervals. All times include the start of
+the command.
 """,
     "angles": """The table shows the time of `mode=predict` for 100,000 rows. This model predicts an angle with a von
 Mises density. The ends of the intervals come from Newton's method on the distribution function. Before this change, the
 ends came from a general search, which evaluated the distribution function some fifty times for each block: 7 s for
-5,000 rows, which is 140 s for this table and is not measured here. The wanted value of 4 s is missed: about five rounds
-of Newton's method, each with a quadrature, take 3.6 ms for a block.
+5,000 rows, which is 140 s for this table and is not measured here. The project wants at most 4 s, and the command takes
+longer: about five rounds of Newton's method, each with a quadrature, take 3.6 ms for a block.
 """,
 }
 SECTIONS: dict[str, tuple[str, Callable[[Path, Path | None], str]]] = {

@@ -276,10 +276,10 @@ def report(rows: Record) -> str:
             'between the vertices. "Over the mesh" networks improve the drawn mesh.',
             "",
             "The people are generated (`human_scans`), not real: 160 are for training and 16 for the test, with 96 "
-            "views of 256 × 192 pixels. A mesh has 7k or 27k coloured vertices and is drawn with 4 × 4 samples per "
-            "pixel unless the row says otherwise. The columns of the table compare the images with photographs over "
-            "the whole frame, or inside, that is over the pixels of the subject. ± is the standard deviation over "
-            "seeds, if there are several.",
+            "views of 256 × 192 pixels. A mesh has about 7,000 (7k) or 27,000 (27k) coloured vertices and is drawn "
+            "with 4 × 4 samples per pixel unless the row says otherwise. The columns of the table compare the images "
+            "with photographs over the whole frame, or inside, that is over the pixels of the subject. ± is the "
+            "standard deviation over seeds, if there are several.",
             "",
             "Each row of the table with another number of epochs is a separate training run of a rendering network, "
             "because the learning rate falls to 0 at the end of a training. The minutes are the number of epochs "
