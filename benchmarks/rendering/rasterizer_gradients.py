@@ -173,8 +173,8 @@ def main() -> None:
         "",
         "The methods are named in the first column of the table. `boundary` is the gradient with the movement of "
         "edges (Li et al., SIGGRAPH Asia 2018), and `interior` is the same gradient without it. `nmr` is the "
-        "approximation of Kato et al. (CVPR 2018). `soft` is the blurred image of Liu et al. (ICCV 2019). Its "
-        "gradient is exact for the blurred image; the table shows how far it is from the gradient of the sharp "
+        "approximation of Kato et al. (CVPR 2018). `soft` is the gradient of the blurred image of Liu et al. (ICCV "
+        "2019). It is exact for the blurred image; the table shows how far it is from the gradient of the sharp "
         "image. `knob` is the setting that trades error for run time: the samples a pixel along each axis, or the "
         "width of the blur.",
         "",

@@ -261,8 +261,8 @@ def frames_section() -> str:
         [
             f"The images for the run times show a synthetic body of {body().shape[1]:,} points. The points are "
             f"projected with splats, which are discs around the points with a radius of {SPLAT} pixels, as in "
-            f"`experiment=smplpix/quick`. The body covers {cover[0]:.0%} of the larger image and {cover[1]:.0%} of "
-            "the smaller one.",
+            f"`experiment=smplpix/quick`. The body covers {cover[0]:.0%} of the larger image ({SIZES[0][0]} × "
+            f"{SIZES[0][1]} pixels) and {cover[1]:.0%} of the smaller image ({SIZES[1][0]} × {SIZES[1][1]} pixels).",
             "",
             f"A run time of a network is the processor time of one thread: the median of {ROUNDS} rounds, with the "
             "smallest and largest time in brackets. The networks are measured in turn. In the rows `projection` only "
