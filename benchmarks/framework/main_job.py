@@ -193,9 +193,10 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         "The main job is `python -m framework experiment=pascal3d/scvae` with all its default settings: it trains an "
         "sCVAE on generated images of cars, tests it, draws its figures and sends the run to MLflow. This page says "
         "how long each part takes, and whether a faster run has the same error. `before` is the version of commit "
-        f"`{BEFORE}`, which trains in float32 (`32-true`) with two threads. `after` is the version of the date below, "
-        "which trains with one thread, in float32 by default and in bfloat16 with `trainer.precision=bf16-mixed`. "
-        "The value `auto` means `bf16-mixed` on a processor that multiplies bfloat16 numbers fast.",
+        f"`{BEFORE}`, which trains in float32 (`32-true`) with two threads. `after` is the version at the date of "
+        "this page, which trains with one thread, in float32 by default and in bfloat16 with "
+        "`trainer.precision=bf16-mixed`. The value `auto` means `bf16-mixed` on a processor that multiplies bfloat16 "
+        "numbers fast.",
         "",
         "Wall time and processor time in the table are those of the main job, the whole command with all its "
         "processes. The times of the parts are differences of times in the journal of the run. Each cell is the "

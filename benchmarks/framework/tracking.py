@@ -53,7 +53,7 @@ def main() -> None:
             "This page says how much longer a run takes because it is sent to MLflow. The run is as short as possible, "
             f"so that nothing hides the cost: `{' '.join(RUN)}`, with `logger=mlflow` (a new SQLite store, which is "
             f"created in the run) and with `logger=none`. `before` is the version of commit `{commit}`, `after` is "
-            "this version.",
+            "the version at the date of this page.",
             "",
             "The first two columns of the table are differences between the run with `logger=mlflow` and the run "
             "with `logger=none`. Processor time is that of the command with all its processes. The last column is "

@@ -244,7 +244,8 @@ def report() -> str:
             "# rasterizer: run time of an image",
             "",
             "This page measures the processor time that the renderer `rasterizer` needs for one image. It compares "
-            "the channels of the image, the number of vertices, and forward rendering with gradients.",
+            "the times for different channels of the image and different numbers of vertices, without and with "
+            "gradients.",
             "",
             f"The rendered image has {HEIGHT} rows × {WIDTH} columns and shows a synthetic closed body, which covers "
             f"{cover:.0%} of the pixels. A time is the lowest of {ROUNDS} medians of 40 calls on one thread. The "
