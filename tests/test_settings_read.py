@@ -113,6 +113,7 @@ COMMANDS: dict[str, Sequence[str]] = {
     "work_precision": ("checkpoint={combine}", "mode.metrics=[nll]", "mode.repeats=2"),
     "check": ("data=moons",),
     "plugins": (),
+    "new": ("mode.plugin=density_head/my_head", "mode.folder={new}"),
     "sync": ("mode.run={train}",),
 }
 """Working command for each mode; `{mode}` is the folder of an earlier run of that mode."""

@@ -55,6 +55,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "check": ("metric=[accuracy]", "torchmetrics"),
     "plugins": ("", ""),
+    "new": ("mode.plugin=density_head/my_head", ""),
     "sync": ("mode.run=train", ""),
 }
 """Settings of a command for each mode, and the slow packages that this command needs besides torch."""

@@ -47,6 +47,7 @@ MODES: Mapping[str, Mode] = {
     "work_precision": Mode((*_STORED, "checkpoint"), ("data", "metric", *MODEL)),
     "check": Mode((*BUNDLES, *GROUPS)),
     "plugins": Mode(),
+    "new": Mode(),
     "sync": Mode(),
 }
 """Keys that each mode reads, by the name of the mode."""

@@ -7,7 +7,8 @@ from typing import Any
 
 import torch
 from rich import box
-from rich.console import Console
+from rich.console import Console, Group
+from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
@@ -58,22 +59,22 @@ def run(config: Config) -> None:
     console, lines, failed = Console(), [], []
     for group, part in chosen:
         plain = {key: value for key, value in part.items() if key != "name"}
-        table, findings, broken = examine(contract(group, part["name"], plain), console)
-        console.print(table)
+        report, findings, broken = examine(contract(group, part["name"], plain), console)
+        console.print(report)
         lines += findings
         failed += broken
     config.folder.mkdir(parents=True, exist_ok=True)
     write_csv(lines, COLUMNS, config.folder / "check.csv")
-    console.print(f"all findings: {config.folder / 'check.csv'}", soft_wrap=True)
+    console.print(f"all findings, with the worst case of each: {config.folder / 'check.csv'}", soft_wrap=True)
     if failed:
         raise ContractBroken(
-            f"{len(failed)} of {len(lines)} checks failed: {', '.join(dict.fromkeys(failed))}. The tables above name "
-            "the cases in which they failed; the docstring of the base class in framework/ states the contract."
+            f"{len(failed)} of {len(lines)} checks failed: {', '.join(dict.fromkeys(failed))}. The lines that begin "
+            "with FAILS name the cases; the docstring of the base class in framework/ states the contract."
         )
 
 
-def examine(plugin: Contract, console: Console) -> tuple[Table, list[dict[str, object]], list[str]]:
-    """Return a plugin's table (worst case of each tested property), all test results, and the failed properties."""
+def examine(plugin: Contract, console: Console) -> tuple[Group, list[dict[str, object]], list[str]]:
+    """Return a plugin's report (worst case of each tested property), all test results, and the failed properties."""
     start = time.perf_counter()
     worst: dict[str, tuple[Row, Finding]] = {}
     lines: list[dict[str, object]] = []
@@ -88,7 +89,7 @@ def examine(plugin: Contract, console: Console) -> tuple[Table, list[dict[str, o
                 if before is None or _excess(finding) > _excess(before[1]):
                     worst[finding.name] = (row, finding)
     seconds = time.perf_counter() - start
-    return _table(plugin, worst, seconds), lines, failed
+    return _report(plugin, worst, seconds), lines, failed
 
 
 def _chosen_plugins(settings: Settings) -> list[tuple[str, Mapping[str, Any]]]:
@@ -121,31 +122,39 @@ def _line(plugin: Contract, row: Row, finding: Finding) -> dict[str, object]:
     }
 
 
-def _table(plugin: Contract, worst: Mapping[str, tuple[Row, Finding]], seconds: float) -> Table:
+def _report(plugin: Contract, worst: Mapping[str, tuple[Row, Finding]], seconds: float) -> Group:
+    """Return the table of all properties, and below it the case of each failure and what was not checked."""
     count = f"{len(plugin.rows)} row{'s' if len(plugin.rows) > 1 else ''}"
     title = f"{plugin.group} {plugin.name}: {count}, {seconds:.1f} s"
     table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left")
-    table.add_column("property", no_wrap=True)
-    table.add_column("worst case (row: case)", overflow="fold")
+    table.add_column("property", overflow="fold")
     for heading in ("error", "limit"):
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("verdict", no_wrap=True)
+    notes: list[tuple[str, str, str]] = []
     for name, (row, finding) in worst.items():
-        case = "" if finding.error == 0 else f"{row.name}: {finding.worst}"
         verdict = Text("holds", "green") if finding.holds else Text("FAILS", "bold red")
-        table.add_row(name, Text(case, "dim"), f"{finding.error:.2g}", f"{finding.limit:g}", verdict)
-    left_out = {
-        name: reason for row in plugin.rows for name, reason in row.leave_out.items() if name not in worst
-    }
-    for name, reason in left_out.items():
-        table.add_row(name, Text(reason, "dim"), "", "", Text("left out", "yellow"))
+        table.add_row(name, f"{finding.error:.2g}", f"{finding.limit:g}", verdict)
+        if not finding.holds:
+            notes.append(("FAILS", "bold red", f"{name}: {row.name}: {finding.worst}"))
+    reasons: dict[str, list[str]] = {}
+    for row in plugin.rows:
+        for name, reason in row.leave_out.items():
+            if name not in worst and name not in reasons.setdefault(reason, []):
+                reasons[reason].append(name)
+    notes += [
+        ("left out", "yellow", f"{', '.join(names)}: {reason}") for reason, names in reasons.items() if names
+    ]
     uncompared = [row.name for row in plugin.rows if isinstance(row, HeadRow) and row.cases is None]
     if uncompared:
-        table.add_row(
-            "log_prob",
-            Text(f"{', '.join(uncompared)}: {UNCOMPARED}", "dim"),
-            "",
-            "",
-            Text("no reference", "yellow"),
-        )
-    return table
+        notes.append(("no reference", "yellow", f"{', '.join(uncompared)}: {UNCOMPARED}"))
+    return Group(table, *(_note(*note) for note in notes))
+
+
+def _note(label: str, style: str, text: str) -> Padding:
+    """Return a labelled line; its continuation lines are indented."""
+    grid = Table.grid(padding=(0, 2, 0, 0))
+    grid.add_column(no_wrap=True)
+    grid.add_column(overflow="fold")
+    grid.add_row(Text(label, style), Text(text))
+    return Padding(grid, (0, 0, 0, 2))

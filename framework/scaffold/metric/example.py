@@ -1,0 +1,39 @@
+"""Largest error of a sample."""
+
+from typing import ClassVar, Literal
+
+from torch import Tensor
+
+from framework.metric import Mean
+from framework.prediction import Prediction
+from framework.target import Target
+
+
+class Example(Mean):
+    """Mean over samples of the largest absolute error of a sample's numbers, in the unit of the target.
+
+    The error is that of the point prediction. The metric has its standard error over samples.
+
+    Raises:
+        ConfigError: the target is not real-valued.
+    """
+
+    bibtex = ""
+    columns: ClassVar[dict[str, str]] = {"example": "largest error"}
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"example": "lower"}
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        target.require("real", by="metric example")
+        self.start()
+
+    def update(self, prediction: Prediction) -> None:
+        """Add the predictions of a batch."""
+        # convert to float64 first, so that the difference is not rounded to float32
+        error = prediction.point.double() - prediction.target.double()
+        self.add_samples(error.abs().amax(-1))
+
+    def compute(self) -> dict[str, Tensor]:
+        """Return the mean and its standard error."""
+        mean, error = self.mean_and_error()
+        return {"example": mean, "example_sem": error}
