@@ -1,7 +1,7 @@
 """Laplace densities of real numbers."""
 
 import math
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -27,15 +27,17 @@ class Laplace(Distribution):
         scale: b > 0, (*batch, number).
     """
 
-    arg_constraints: ClassVar = {}
-    support = constraints.real_vector
-
     def __init__(
         self, location: Float[Tensor, "*batch number"], scale: Float[Tensor, "*batch number"]
     ) -> None:
         self.location = location
         self.scale = scale
         super().__init__(location.shape[:-1], location.shape[-1:], validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint:
+        """Values that the density describes: vectors of real numbers."""
+        return constraints.real_vector
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log-density, nats."""

@@ -1,6 +1,6 @@
 """Several copies of a model, with equal weights."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated
 
 import torch
@@ -28,7 +28,7 @@ class Example(Uncertainty):
 
     def __init__(self, model: Callable[[], Predictor], *, members: Annotated[int, Field(ge=1)] = 3) -> None:
         super().__init__()
-        self.members = nn.ModuleList(model() for _ in range(members))
+        self.members: Sequence[Predictor] = nn.ModuleList(model() for _ in range(members))  # type: ignore[assignment]
 
     def forward(self, inputs: Tensor) -> Distribution:
         """Return the mixture of the members' densities."""
