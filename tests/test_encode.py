@@ -6,11 +6,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from framework.configuration.schema import build, resolve
-from framework.configuration.settings import Settings
+from framework.datasets.shards import open_shards, part_name
 from framework.errors import ConfigError, DataError
-from framework.modes.encode import collect_files, describe, encode, parts_of_job
+from framework.modes.encode import (
+    Collection,
+    Files,
+    collect_files,
+    describe,
+    encode,
+    parts_of_job,
+    require_apart,
+)
 from framework.storage import progress
 from tests.conftest import Done, Framework
 
@@ -18,7 +27,7 @@ CONFIG = {
     "data": resolve("data", {"name": "point_cloud_folder", "points": 50}),
     "encoder": [resolve("encoder", {"name": "bps", "points": 20, "features": ["distance", "delta"]})],
 }
-SETTINGS = Settings(batch_size=3)
+BATCH = 3
 
 
 @pytest.fixture
@@ -32,6 +41,12 @@ def root(tmp_path):
     return tmp_path / "clouds"
 
 
+def collected(root, into, part):
+    """Return the collection of all files of `root`."""
+    names = [file.relative_to(root).as_posix() for file in collect_files(root)]
+    return Collection(Files(root, names, part, build("data", CONFIG["data"])), into)
+
+
 def alone(root, name):
     """Return the features of one file, encoded alone."""
     data = build("data", CONFIG["data"])
@@ -43,9 +58,9 @@ def alone(root, name):
 def test_rows_of_the_parts_are_the_files_by_name(root, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(progress, "QUIET_TIME", 0.0)
     monkeypatch.setattr(progress, "REPORT_INTERVAL", 0.0)
-    collection = collect_files(root, tmp_path / "features", 4)
+    collection = collected(root, tmp_path / "features", 4)
     describe(collection, CONFIG)
-    assert encode(collection, CONFIG, range(3), SETTINGS) == 3
+    assert encode(collection, CONFIG, range(3), BATCH) == 3
     assert re.findall(r"encoding: (\d+) of 11 files", capsys.readouterr().err) == ["3", "4", "7", "8", "11"]
     names = (tmp_path / "features" / "files.txt").read_text().splitlines()
     assert names == sorted(f"{'ab'[number % 2]}/{number:02}.npy" for number in range(11))
@@ -56,29 +71,29 @@ def test_rows_of_the_parts_are_the_files_by_name(root, tmp_path, monkeypatch, ca
 
 
 def test_a_stopped_job_goes_on_and_jobs_share_the_parts(root, tmp_path):
-    collection = collect_files(root, tmp_path / "features", 2)
+    collection = collected(root, tmp_path / "features", 2)
     describe(collection, CONFIG)
     assert [list(parts_of_job(6, f"{job}/4")) for job in (1, 2, 3, 4)] == [[0, 4], [1, 5], [2], [3]]
-    broken = collection.files(4)[1]
+    broken = collection.source.files(4)[1]
     content = broken.read_bytes()
     broken.write_bytes(b"no array")
     with pytest.raises(DataError, match=broken.name):
-        encode(collection, CONFIG, parts_of_job(6, "1/2"), SETTINGS)
+        encode(collection, CONFIG, parts_of_job(6, "1/2"), BATCH)
     assert collection.missing() == [1, 3, 4, 5]  # parts before it are kept
     first = collection.path(0).stat().st_mtime_ns
     broken.write_bytes(content)
     describe(collection, CONFIG)
-    assert encode(collection, CONFIG, parts_of_job(6, "1/2"), SETTINGS) == 1
-    assert encode(collection, CONFIG, parts_of_job(6, "2/2"), SETTINGS) == 3
+    assert encode(collection, CONFIG, parts_of_job(6, "1/2"), BATCH) == 1
+    assert encode(collection, CONFIG, parts_of_job(6, "2/2"), BATCH) == 3
     assert collection.missing() == []
     assert collection.path(0).stat().st_mtime_ns == first
-    assert encode(collection, CONFIG, range(6), SETTINGS) == 0
+    assert encode(collection, CONFIG, range(6), BATCH) == 0
     assert not list((tmp_path / "features").glob(".*"))  # nothing half written
 
 
 @pytest.mark.parametrize("change", ["part", "encoder", "files"])
 def test_parts_of_something_else_are_not_added_to(root, tmp_path, change):
-    describe(collect_files(root, tmp_path / "features", 2), CONFIG)
+    describe(collected(root, tmp_path / "features", 2), CONFIG)
     config, part = CONFIG, 2
     if change == "part":
         part = 3
@@ -87,24 +102,20 @@ def test_parts_of_something_else_are_not_added_to(root, tmp_path, change):
     else:
         np.save(root / "a" / "more.npy", np.zeros((4, 3)))
     with pytest.raises(ConfigError, match=rf"says {change} = .* do not belong to this job"):
-        describe(collect_files(root, tmp_path / "features", part), config)
+        describe(collected(root, tmp_path / "features", part), config)
 
 
 def test_what_cannot_be_encoded_is_refused(root, tmp_path):
     with pytest.raises(ConfigError, match="would be read as files"):
-        collect_files(root, root / "a" / "features", 4)
+        require_apart(root, root / "a" / "features")
     with pytest.raises(DataError, match="no folder with files"):
-        collect_files(tmp_path / "nowhere", tmp_path / "features", 4)
+        collect_files(tmp_path / "nowhere")
     with pytest.raises(ConfigError, match=r"no job 3 of 2\. Use 1/2 to 2/2"):
         parts_of_job(6, "3/2")
-    collection = collect_files(root, tmp_path / "features", 4)
-    for encoders, told in (
-        ([], "needs an encoder"),
-        ([resolve("encoder", {"name": "pointnet"})], "pointnet is trained"),
-    ):
-        (tmp_path / "features").mkdir(exist_ok=True)
-        with pytest.raises(ConfigError, match=told):
-            encode(collection, {**CONFIG, "encoder": encoders}, range(3), SETTINGS)
+    collection = collected(root, tmp_path / "features", 4)
+    (tmp_path / "features").mkdir()
+    with pytest.raises(ConfigError, match="pointnet is trained"):
+        encode(collection, {**CONFIG, "encoder": [resolve("encoder", {"name": "pointnet"})]}, range(3), BATCH)
     assert collection.missing() == [0, 1, 2]
 
 
@@ -155,3 +166,88 @@ def test_a_folder_may_hold_other_files_and_a_failure_leaves_nothing(
     names = (features / "files.txt").read_text().splitlines()
     assert names == sorted(f"{'ab'[number % 2]}/{number:02}.npy" for number in range(1, 11))
     assert np.load(features / "part-000000.npy").shape == (10, 20)
+
+
+def call(framework: Framework, *words: str) -> Done:
+    return framework("mode=encode", "logger=none", "threads=1", "batch_size=3", *words, folder=None)
+
+
+ENCODER = ("encoder=[bps]", "encoder.bps.points=20", "encoder.bps.features=[distance,delta]")
+
+
+def test_shards_give_the_features_of_the_files(framework: Framework, root: Path, tmp_path: Path) -> None:
+    """Packed by one command and encoded by another, clouds of different sizes have the same bytes as from files."""
+    data = ("data=point_cloud_folder", "data.points=50")
+    packed = call(framework, *data, f"mode.files={root}", "mode.into=shards", "mode.part=4", "mode.pack=true")
+    assert packed.code == 0, packed.out
+    shards = open_shards(tmp_path / "shards")
+    assert (shards.samples, shards.columns, shards.size(2)) == (11, ("x", "y", "z"), 3)
+    assert shards.read(1).shape == (4, 40, 3)
+    assert [len(batch[0]) for batch in shards.batches(1, 3)] == [40, 33], "padding that no cloud needs"
+    for source, into, more in ((root, "of_files", (*data, "mode.part=4")), ("shards", "of_shards", ())):
+        done = call(framework, *ENCODER, *more, f"mode.files={source}", f"mode.into={into}")
+        assert done.code == 0, done.out
+    for number in range(3):
+        parts = [tmp_path / folder / part_name(number) for folder in ("of_files", "of_shards")]
+        assert parts[0].read_bytes() == parts[1].read_bytes()
+    pack = ("mode.pack=true",)
+    for words, message in (
+        ((*ENCODER, "mode.part=5"), "mode.part=5 has no effect"),
+        ((*ENCODER, "data=point_cloud_folder"), "inputs were read with data = "),
+        (pack, "a folder of shards already"),
+        ((*ENCODER, *pack), "an encoder is chosen too"),
+        ((), "needs an encoder"),
+    ):
+        done = call(framework, *words, "mode.files=shards", "mode.into=three")
+        assert done.code and message in done.out, done.out
+    assert not (tmp_path / "three").exists()
+
+
+INDEX = {"version": 1, "files": 5, "part": 3, "columns": ["x", "y", "z"]}
+
+
+def test_shards_of_another_program_are_read_and_damaged_ones_refused(tmp_path: Path) -> None:
+    clouds = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float32)
+    index, first = tmp_path / "encoding.json", tmp_path / part_name(0)
+    np.save(first, clouds[:3])
+    np.save(tmp_path / part_name(1), clouds[3:])
+    for entries in (INDEX, {key: INDEX[key] for key in ("version", "files", "part")}):
+        index.write_text(json.dumps(entries))
+        shards = open_shards(tmp_path)
+        np.testing.assert_array_equal(torch.cat([shards.read(0), shards.read(1)]).numpy(), clouds)
+    shards.read(0)[:] = 0  # a private copy
+    np.testing.assert_array_equal(np.load(first), clouds[:3])
+    for change in ({"version": 2}, {"files": 0}, {"part": True}, {"columns": "xyz"}, {"data": []}):
+        index.write_text(json.dumps({**INDEX, **change}))
+        with pytest.raises(DataError, match=rf"{next(iter(change))} = .* is not valid"):
+            open_shards(tmp_path)
+    index.write_text(json.dumps({**INDEX, "files": 10**9, "part": 1}))
+    with pytest.raises(DataError, match="names 1,000,000,000 shards"):
+        open_shards(tmp_path)
+    index.write_text(json.dumps({**INDEX, "encoder": [{"name": "bps"}]}))
+    with pytest.raises(DataError, match="features that mode=encode has computed"):
+        open_shards(tmp_path)
+    index.write_text(json.dumps(INDEX))
+    shards = open_shards(tmp_path)
+    for array, message in (
+        (clouds[:2], "holds 3 samples"),
+        (clouds[:3, :, :2], "names 3 columns"),
+        (clouds[:3].astype(object), "no objects"),
+        (clouds[:3].astype(">f4"), "cannot be read as a shard"),
+    ):
+        np.save(first, array)
+        with pytest.raises(DataError, match=message):
+            shards.read(0)
+    np.save(first, clouds[:3])
+    first.write_bytes(first.read_bytes()[:-1])
+    with pytest.raises(DataError, match="takes 252 bytes, but only 251"):
+        shards.read(0)
+    for path in (first, index):
+        moved = path.rename(tmp_path / "elsewhere")
+        path.symlink_to(moved)
+        with pytest.raises(DataError, match="is a link"):
+            open_shards(tmp_path).read(0)
+        moved.replace(path)
+    first.unlink()
+    with pytest.raises(DataError, match="the index of the folder names more shards"):
+        shards.read(0)

@@ -11,10 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
+from framework.configuration.schema import build, resolve
 from framework.errors import DataError, escape_undecodable, quote, shorten
 from framework.figures.style import save_figure
 from framework.geometry import meshes
-from framework.modes.encode import collect_files, describe
+from framework.modes.encode import Collection, Files, collect_files, describe
 from framework.reports import table
 from framework.storage.names import as_bytes, path_of, spell_name
 from framework.sweeps import jobs
@@ -80,7 +81,9 @@ def clouds(tmp_path: Path) -> Path:
 
 
 def test_encoded_files_are_found_by_the_names_beside_their_features(clouds: Path, tmp_path: Path) -> None:
-    collection = collect_files(clouds, tmp_path / "features", 100)
+    names = [file.relative_to(clouds).as_posix() for file in collect_files(clouds)]
+    data = build("data", resolve("data", "point_cloud_folder"))
+    collection = Collection(Files(clouds, names, 100, data), tmp_path / "features")
     describe(collection, {"data": {}, "encoder": []})
     lines = (tmp_path / "features" / "files.txt").read_text(encoding="utf-8").splitlines()
     assert len(lines) == 2 * len(NAMES)

@@ -1,10 +1,13 @@
-"""mode=encode: compute the features of many files in parts; several jobs can share them, and a job can be resumed."""
+"""mode=encode: compute the features of many samples in parts; several jobs can share them, and a job can be resumed.
+
+The samples are the files of a folder, or a folder of shards (`framework.datasets.shards`). With `mode.pack=true` the
+mode writes the inputs themselves, which makes shards of files.
+"""
 
 import hashlib
-import io
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,62 +17,132 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.configuration.config import Config, Options
+from framework.configuration.modes import idle_sentence
 from framework.configuration.schema import build, resolve
-from framework.configuration.settings import Settings
 from framework.data import Data
+from framework.datasets.shards import INDEX, Shards, is_folder_of_shards, open_shards, part_name
 from framework.encoder import Encoder
-from framework.errors import ConfigError, DataError
+from framework.errors import ConfigError, DataError, quote
+from framework.geometry.clouds import pad
+from framework.runs.job import refuse_idle
 from framework.runs.run import open_run
 from framework.runs.session import record_citations, set_up_process
 from framework.runs.user_files import UNREADABLE, select_files
 from framework.storage.enclosed import require_enclosed
-from framework.storage.files import write_whole
+from framework.storage.files import remove_leftovers, replacing, write_whole
 from framework.storage.names import spell_name
 from framework.storage.plain_values import read_json
 from framework.storage.progress import Work
 from framework.training.batches import Batches
 
-DESCRIPTION, NAMES = "encoding.json", "files.txt"
+DESCRIPTION, NAMES = INDEX, "files.txt"
 """Two files beside the features: settings of the computation, and names of the encoded files, one per line."""
 
 
 class EncodeOptions(Options):
-    """Options of mode=encode: the files, the folder for the features, files per part, and this job's share of parts."""
+    """Options of mode=encode.
+
+    Attributes:
+        files: Folder of the files, or folder of shards.
+        into: Folder for the features.
+        part: Number of files in a part.
+        share: Share of the parts that this job computes.
+        pack: Whether to write the inputs themselves, as shards.
+    """
 
     files: str
     into: str
     part: Annotated[int, Field(gt=0)] = 1000
     share: Annotated[str, Field(pattern=r"^[1-9]\d*/[1-9]\d*$")] = "1/1"
+    pack: bool = False
 
 
 @dataclass(frozen=True)
-class Collection:
-    """Files to encode, and the folder for their features. The features of `part` files are written to one file, a part.
+class Files:
+    """Source of one sample per file.
 
     Attributes:
         root: Folder to which the names are relative.
         names: Names of the files, in order.
         part: Number of files in a part.
-        into: Folder for the features.
+        data: Data set that reads the files.
+        workers: Number of data-loading processes.
     """
 
     root: Path
     names: Sequence[str]
     part: int
-    into: Path
+    data: Data
+    workers: int = 0
 
     @property
-    def parts(self) -> int:
-        """Return the number of parts."""
-        return -(-len(self.names) // self.part)
+    def columns(self) -> tuple[str, ...]:
+        """Return the names of the numbers in the last dimension of an input; () if they have none."""
+        return self.data.columns
+
+    @property
+    def samples(self) -> int:
+        """Return the number of files."""
+        return len(self.names)
+
+    @property
+    def text(self) -> bytes:
+        """Return the names of the files as the content of a text file, one per line."""
+        return "".join(f"{spell_name(name)}\n" for name in self.names).encode()
+
+    @property
+    def digest(self) -> str:
+        """Return a hash of the names."""
+        return hashlib.sha256(self.text).hexdigest()
 
     def files(self, number: int) -> list[Path]:
         """Return the files of part `number`, counted from 0."""
         return [self.root / name for name in self.names[number * self.part : (number + 1) * self.part]]
 
+    def size(self, number: int) -> int:
+        """Return the number of files of part `number`, counted from 0."""
+        return len(self.files(number))
+
+    def batches(self, number: int, batch_size: int) -> Iterator[Tensor]:
+        """Yield the inputs of part `number` in batches.
+
+        Raises:
+            DataError: A file cannot be read, or holds several samples; the message names it.
+        """
+        files = self.files(number)
+        dataset = self.data.read(files)
+        sample_count: int = len(dataset)  # type: ignore[arg-type]
+        if sample_count != len(files):
+            raise DataError(
+                f"{files[0]} … {files[-1]}: {len(files)} files contain {sample_count} samples, but mode=encode "
+                "needs one sample per file. Split files with several samples, and leave out files without a "
+                "sample."
+            )
+        batches = Batches(self.data, batch_size=batch_size, workers=self.workers, seed=0)
+        for batch in batches.of(dataset):
+            yield batch["input"]
+
+
+@dataclass(frozen=True)
+class Collection:
+    """Samples to encode, and the folder for their features. The features of a part are written to one file.
+
+    Attributes:
+        source: The samples.
+        into: Folder for the features.
+    """
+
+    source: Files | Shards
+    into: Path
+
+    @property
+    def parts(self) -> int:
+        """Return the number of parts."""
+        return -(-self.source.samples // self.source.part)
+
     def path(self, number: int) -> Path:
         """Return the path of the file for the features of part `number`."""
-        return self.into / f"part-{number:06}.npy"
+        return self.into / part_name(number)
 
     def missing(self) -> list[int]:
         """Return the numbers of the parts that are not written yet."""
@@ -80,32 +153,34 @@ def run(config: Config) -> None:
     """Compute and write this job's parts of the features; parts that already exist are left unchanged."""
     options = config.options(EncodeOptions)
     console = set_up_process(config.settings)
+    root, into = Path(options.files).expanduser(), Path(options.into).expanduser()
+    shards = open_shards(root) if is_folder_of_shards(root) else None
     parts = {
-        "data": resolve("data", config.settings.data or {}),
+        "data": resolve("data", config.settings.data or {}) if shards is None else data_of(shards, config),
         "encoder": [
             resolve("encoder", part, f"encoder.{key}")
             for key, part in (config.settings.encoder or {}).items()
         ],
     }
-    if not parts["encoder"]:
-        raise ConfigError(
-            "mode=encode needs an encoder, but none is chosen. Add encoder=[...]; mode=plugins lists the encoders."
-        )
-    collection = collect_files(
-        Path(options.files).expanduser(), Path(options.into).expanduser(), options.part
-    )
-    require_enclosed(collection.into, ConfigError)
-    files = [collection.root / name for name in collection.names]
-    readable, unreadable = select_files(build("data", parts["data"]), files, parts["data"], console)
-    collection = replace(
-        collection, names=[file.relative_to(collection.root).as_posix() for file in readable]
-    )
+    require_task(options, parts["encoder"], shards)
+    require_apart(root, into)
+    require_enclosed(into, ConfigError)
+    unreadable: list[Path] = []
+    if shards is None:
+        data: Data = build("data", parts["data"])
+        files = collect_files(root)
+        readable, unreadable = select_files(data, files, parts["data"], console)
+        names = [file.relative_to(root).as_posix() for file in readable]
+        collection = Collection(Files(root, names, options.part, data, config.settings.workers), into)
+    else:
+        collection = Collection(shards, into)
     part_numbers = parts_of_job(collection.parts, options.share)
     with open_run(config) as run:
-        record_citations(run, parts)
+        record_citations(run, {key: part for key, part in parts.items() if part})
         describe(collection, parts)
+        remove_leftovers(into)
         try:
-            written = encode(collection, parts, part_numbers, config.settings)
+            written = encode(collection, parts, part_numbers, config.settings.batch_size)
         except BaseException:
             # Without any part, remove the description, because another attempt may use other settings.
             if len(collection.missing()) == collection.parts:
@@ -114,13 +189,70 @@ def run(config: Config) -> None:
             raise
         describe(collection, parts)  # written again if another job failed meanwhile and removed it
         if unreadable:
-            left_out = "".join(f"{spell_name(file.relative_to(collection.root))}\n" for file in unreadable)
+            left_out = "".join(f"{spell_name(file.relative_to(root))}\n" for file in unreadable)
             write_whole(collection.into / UNREADABLE, left_out.encode())
         missing = len(collection.missing())
         console.print(
             f"{written} parts written, {len(part_numbers) - written} of this job's {len(part_numbers)} parts existed "
             f"already; {missing} of all {collection.parts} parts are missing in {collection.into}",
             soft_wrap=True,
+        )
+
+
+def data_of(shards: Shards, config: Config) -> Mapping[str, Any] | None:
+    """Return the resolved config of the data set that has read the files of a folder of shards; None if none is known.
+
+    Raises:
+        ConfigError: The command chooses another data set, or sets what only the reading of files uses.
+    """
+    for key, why in (
+        ("mode.part", "a part has as many samples as a shard of mode.files"),
+        ("workers", "mode.files is a folder of shards, which need no data-loading processes"),
+    ):
+        if override := config.first_override(key):
+            refuse_idle(config.folder, idle_sentence(override, why))
+    stored = None if shards.data is None else resolve("data", shards.data)
+    if config.settings.data and (chosen := resolve("data", config.settings.data)) != stored:
+        raise ConfigError(
+            f"mode.files={shards.folder} is a folder of shards whose inputs were read with data = {quote(stored)}, but "
+            f"the command has data = {quote(chosen)}. Leave out the settings of data, or pack the files again."
+        )
+    return stored
+
+
+def require_task(options: EncodeOptions, encoders: Sequence[Any], shards: Shards | None) -> None:
+    """Require that a command either encodes, or packs files.
+
+    Raises:
+        ConfigError: There is no encoder; or the command packs, and has an encoder or reads shards.
+    """
+    if not options.pack and not encoders:
+        raise ConfigError(
+            "mode=encode needs an encoder, but none is chosen. Add encoder=[...]; mode=plugins lists the encoders. To "
+            "store the inputs themselves, add mode.pack=true."
+        )
+    if options.pack and encoders:
+        raise ConfigError(
+            "mode.pack=true stores the inputs themselves, but an encoder is chosen too. Leave out the encoder, and "
+            "encode the shards with a second command."
+        )
+    if options.pack and shards is not None:
+        raise ConfigError(
+            f"mode.files={options.files} is a folder of shards already. Give the folder of the files, or leave out "
+            "mode.pack."
+        )
+
+
+def require_apart(root: Path, into: Path) -> None:
+    """Refuse a folder for the features that lies inside the folder of the files.
+
+    Raises:
+        ConfigError: It does.
+    """
+    if into.resolve().is_relative_to(root.resolve()):
+        raise ConfigError(
+            f"mode.into={into} lies inside mode.files={root}, so the features would be read as files. Set mode.into "
+            "to a folder outside of mode.files."
         )
 
 
@@ -138,18 +270,12 @@ def parts_of_job(parts: int, which: str) -> range:
     return range(number - 1, parts, jobs)
 
 
-def collect_files(root: Path, into: Path, part: int) -> Collection:
-    """Collect all files of a folder and its subfolders, except hidden ones, sorted by name.
+def collect_files(root: Path) -> list[Path]:
+    """Return all files of a folder and its subfolders, except hidden ones, sorted by name.
 
     Raises:
         DataError: There are no files.
-        ConfigError: The folder for the features lies inside the folder of the files.
     """
-    if into.resolve().is_relative_to(root.resolve()):
-        raise ConfigError(
-            f"mode.into={into} lies inside mode.files={root}, so the features would be read as files. Set mode.into "
-            "to a folder outside of mode.files."
-        )
     paths = (path.relative_to(root) for path in root.rglob("*") if path.is_file())
     names = sorted(
         path.as_posix() for path in paths if not any(piece.startswith(".") for piece in path.parts)
@@ -158,7 +284,7 @@ def collect_files(root: Path, into: Path, part: int) -> Collection:
         raise DataError(
             f"mode.files={root} is no folder with files. Set mode.files to the folder whose files are to be encoded."
         )
-    return Collection(root, names, part, into)
+    return [root / name for name in names]
 
 
 def describe(collection: Collection, config: Mapping[str, Any]) -> None:
@@ -167,14 +293,16 @@ def describe(collection: Collection, config: Mapping[str, Any]) -> None:
     Raises:
         ConfigError: The folder contains features of other input files, or features that were made with other settings.
     """
-    text = "".join(f"{spell_name(name)}\n" for name in collection.names).encode()
+    source = collection.source
     description = {
         "version": 1,
         **config,
-        "part": collection.part,
-        "files": len(collection.names),
-        "names": hashlib.sha256(text).hexdigest(),
+        "part": source.part,
+        "files": source.samples,
+        "names": source.digest,
     }
+    if not config["encoder"]:
+        description["columns"] = list(source.columns)
     collection.into.mkdir(parents=True, exist_ok=True)
     path = collection.into / DESCRIPTION
     if path.is_file():
@@ -189,62 +317,54 @@ def describe(collection: Collection, config: Mapping[str, Any]) -> None:
                     "folder."
                 )
         return
-    write_whole(collection.into / NAMES, text)
+    if isinstance(source, Files):
+        write_whole(collection.into / NAMES, source.text)
     write_whole(path, json.dumps(description, indent=1).encode())
 
 
 @torch.no_grad()
 def encode(
-    collection: Collection, config: Mapping[str, Any], part_numbers: Sequence[int], settings: Settings
+    collection: Collection, config: Mapping[str, Any], part_numbers: Sequence[int], batch_size: int
 ) -> int:
     """Write the missing parts of a job, each atomically, and return their number.
 
     Args:
-        collection: Files to encode.
-        config: Resolved configs of the data set and the encoders.
+        collection: Samples to encode.
+        config: Resolved configs of the encoders; without an encoder, the inputs themselves are written.
         part_numbers: Numbers of the parts of this job.
-        settings: Settings of the command.
+        batch_size: Number of samples that are encoded together.
 
     Raises:
-        ConfigError: An encoder is trained, or there is no encoder.
+        ConfigError: An encoder is trained.
         DataError: A file cannot be read, or holds several samples; the message names it. Earlier parts are kept.
     """
-    if not config["encoder"]:
-        raise ConfigError(
-            "mode=encode needs an encoder, but none is chosen. Add encoder=[...]; mode=plugins lists the encoders."
-        )
-    data: Data = build("data", config["data"])
+    source = collection.source
     encoders: list[Encoder] = []
     written = 0
-    with Work("encoding", sum(len(collection.files(number)) for number in part_numbers), "files") as work:
+    with Work("encoding", sum(source.size(number) for number in part_numbers), "files") as work:
         for number in part_numbers:
-            files = collection.files(number)
             if collection.path(number).is_file():
-                work.advance(len(files))
+                work.advance(source.size(number))
                 continue
-            dataset = data.read(files)
-            sample_count: int = len(dataset)  # type: ignore[arg-type]
-            if sample_count != len(files):
-                raise DataError(
-                    f"{files[0]} … {files[-1]}: {len(files)} files contain {sample_count} samples, but mode=encode "
-                    "needs one sample per file. Split files with several samples, and leave out files without a "
-                    "sample."
-                )
-            batches = Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=0)
             part_features: list[Tensor] = []
-            for batch in batches.of(dataset):
-                features = batch["input"]
-                if not encoders:
-                    encoders = build_encoders(config["encoder"], tuple(features.shape[1:]), data.columns)
+            for features in source.batches(number, batch_size):
+                if config["encoder"] and not encoders:
+                    encoders = build_encoders(config["encoder"], tuple(features.shape[1:]), source.columns)
                 for encoder in encoders:
                     features = encoder(features)
                 part_features.append(features)
                 work.advance(len(features))
-            content = io.BytesIO()
-            np.save(content, torch.cat(part_features).numpy(), allow_pickle=False)
-            write_whole(collection.path(number), content.getvalue())
+            with replacing(collection.path(number)) as partial, partial.open("wb") as stream:
+                np.save(stream, join(part_features).numpy(), allow_pickle=False)
             written += 1
     return written
+
+
+def join(batches: Sequence[Tensor]) -> Tensor:
+    """Return batches as one batch; point clouds are padded to the largest with rows of NaN."""
+    if len({batch.shape[1:] for batch in batches}) == 1:
+        return torch.cat(list(batches))
+    return pad([cloud for batch in batches for cloud in batch])
 
 
 def build_encoders(

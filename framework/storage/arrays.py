@@ -5,14 +5,19 @@ The readers allocate memory only in proportion to the size of the file, and they
 
 import io
 import math
+import mmap
+import os
 import zipfile
 from collections.abc import Collection
+from pathlib import Path
+from typing import BinaryIO, Literal
 
 import numpy as np
 from numpy.lib import format as layout
 from numpy.typing import NDArray
 
 from framework.errors import shorten
+from framework.storage.enclosed import read_stream
 from framework.storage.reading import most_decompressed
 
 MAGIC = b"\x93NUMPY"
@@ -27,6 +32,35 @@ def read_npy(content: bytes) -> NDArray:
         ValueError: The bytes are no .npy file, are damaged, or contain Python objects or records.
     """
     stream = io.BytesIO(content)
+    shape, order, kind = _read_header(stream, len(content))
+    count = math.prod(shape)
+    if not count:
+        return np.empty(shape, kind)
+    return np.frombuffer(content, kind, count, stream.tell()).reshape(shape, order=order).copy(order)
+
+
+def map_npy(path: Path) -> NDArray:
+    """Return the array in an .npy file as a private memory map.
+
+    The pages of the file are read when they are used. Writing to the array does not change the file. The file must not
+    be shortened while the array is in use.
+
+    Raises:
+        ValueError: As `read_npy`.
+        DataError: The file is a link or no regular file (`framework.storage.enclosed`).
+        OSError: The file cannot be opened.
+    """
+    with read_stream(path) as stream:
+        shape, order, kind = _read_header(stream, os.fstat(stream.fileno()).st_size)
+        count, start = math.prod(shape), stream.tell()
+        if not count:
+            return np.empty(shape, kind)
+        pages = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_COPY)
+    return np.frombuffer(pages, kind, count, start).reshape(shape, order=order)
+
+
+def _read_header(stream: BinaryIO, size: int) -> tuple[tuple[int, ...], Literal["C", "F"], np.dtype]:
+    """Return shape, order and type of the array in an .npy file of `size` bytes; the stream is then at its numbers."""
     version = layout.read_magic(stream)
     if version not in HEADERS:
         raise ValueError(
@@ -38,16 +72,12 @@ def read_npy(content: bytes) -> NDArray:
             f"got an array of type {shorten(kind)} and shape {shorten(shape)}; expected plain numbers or text, no "
             "objects"
         )
-    count, start = math.prod(shape), stream.tell()  # Python integers cannot overflow
-    if count * kind.itemsize > len(content) - start:
+    needed, left = math.prod(shape) * kind.itemsize, size - stream.tell()  # Python integers cannot overflow
+    if needed > left:
         raise ValueError(
-            f"an array of type {kind} and shape {shape} takes {count * kind.itemsize} bytes, but only "
-            f"{len(content) - start} bytes follow"
+            f"an array of type {kind} and shape {shape} takes {needed} bytes, but only {left} bytes follow"
         )
-    if not count:
-        return np.empty(shape, kind)
-    order = "F" if by_columns else "C"
-    return np.frombuffer(content, kind, count, start).reshape(shape, order=order).copy(order)
+    return shape, "F" if by_columns else "C", kind
 
 
 def to_real(values: object, name: str) -> NDArray:

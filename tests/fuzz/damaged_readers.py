@@ -19,6 +19,7 @@ from framework.configuration.config import Config
 from framework.datasets import scan_layout
 from framework.datasets.csv_columns import mostly_numbers, numbers, read_columns
 from framework.datasets.images import Crop
+from framework.datasets.shards import open_shards
 from framework.geometry import meshes
 from framework.runs import resuming
 from framework.storage.generated import read_mark
@@ -127,6 +128,10 @@ def clouds() -> Iterator[Reader]:
     yield Reader("XYZ", "one.xyz", [whole.xyz()], cloud, crafted=crafted.XYZ)
     yield Reader("NPY, clouds", "one.npy", arrays, cloud, crafted=crafted.NPY)
     yield Reader("NPZ, clouds", "one.npz", packed, cloud, [in_zip], [*crafted.npz("points")])
+    shard = npy(np.stack([VERTICES, VERTICES]).astype(np.float32))
+    yield Reader("NPY, shards", "part-000000.npy", [shard], shards, crafted=crafted.NPY)
+    index = b'{"version": 1, "files": 2, "part": 2, "columns": ["x", "y", "z"], "data": {"name": "a"}}'
+    yield Reader("JSON, index of shards", "encoding.json", [index], shards, crafted=crafted.JSONS)
     scans = [whole.dales(False), whole.dales(True)]
     yield Reader(
         "NPZ, objects of scans",
@@ -136,6 +141,13 @@ def clouds() -> Iterator[Reader]:
         [in_zip],
         [*crafted.npz("points")],
     )
+
+
+def shards(file: Path) -> object:
+    """Read a folder of shards, of which the only shard or the index is damaged."""
+    shard = npy(np.stack([VERTICES, VERTICES]).astype(np.float32))
+    beside(file, {"encoding.json": b'{"version": 1, "files": 2, "part": 2}', "part-000000.npy": shard})
+    return [batch.numpy() for batch in open_shards(file.parent).batches(0, 2)]
 
 
 def subjects() -> Iterator[Reader]:
