@@ -305,7 +305,8 @@ def _evaluate_boxes(
 
     The corners are `low` and `high`. Masses and urgency have shape (box, rows). The axis is a mask (box, rows, number).
     The urgency is the difference of the integrals by the two rules. The urgency is raised if the integrand at a
-    candidate or near a known peak is far above the integrand at every node.
+    candidate or near a known peak is far above the integrand at every node, or if it is not at a known peak what it is
+    expected to be from the nodes.
 
     Args:
         mapping: Map from coordinates to values.
@@ -326,6 +327,7 @@ def _evaluate_boxes(
         highest = torch.maximum(highest, even.nan_to_num().amax(1))
         if points == RULES[numbers][0]:
             rough = _roughness(even.nan_to_num(), points, numbers)
+            unlike = _unlike_peaks(mapping, low, high, even.nan_to_num(), points, peak_coordinates)
     size = (high - low).prod(-1)
     point = candidate_coordinates.unsqueeze(1)
     inside = ((point >= low) & (point <= high)).all(-1)  # (candidate, box, rows)
@@ -342,7 +344,7 @@ def _evaluate_boxes(
     split_axis = torch.nn.functional.one_hot(number, numbers).bool()
     # float64 does not resolve a peak in a narrower box
     wide = (high - low).where(split_axis, 0.0).amax(-1) > 1e-13
-    urgency = torch.maximum((sums[0] - sums[1]).abs(), hidden)
+    urgency = torch.maximum((sums[0] - sums[1]).abs(), hidden).fmax(unlike)
     return low, high, sums[0], torch.where(wide & urgency.isfinite(), urgency, 0.0), split_axis
 
 
@@ -368,6 +370,37 @@ def _roughness(integrand: Tensor, points: int, numbers: int) -> Tensor:
         ],
         -1,
     )
+
+
+def _unlike_peaks(
+    mapping: _Map, low: Tensor, high: Tensor, integrand: Tensor, points: int, peak_coordinates: Tensor
+) -> Tensor:
+    """Return by how much the integrand at known peaks on a box's borders differs from its extrapolation, (box, rows).
+
+    A difference shows a peak that is too narrow for the nodes and too low to be far above the integrand beside it, such
+    as that of a component of small weight. The result is 0 for densities of two numbers.
+
+    Args:
+        mapping: Map from coordinates to values.
+        low: Lower ends of the boxes, in coordinates.
+        high: Upper ends of the boxes, in coordinates.
+        integrand: Integrand at the nodes, times the size of the box, (box, node, rows).
+        points: Nodes per side.
+        peak_coordinates: Coordinates of the known peaks.
+    """
+    unlike = torch.zeros_like(low[..., 0])
+    if low.shape[-1] > 1 or not len(peak_coordinates):
+        return unlike
+    value, volume = mapping.values_and_volumes(peak_coordinates)
+    at_peak = (mapping.log_prob(value).exp() * volume).unsqueeze(1).nan_to_num() * (high - low)[..., 0]
+    node, _ = np.polynomial.legendre.leggauss(points)
+    inverse = np.linalg.inv(np.polynomial.legendre.legvander(node, points - 1))
+    for end, border in ((-1.0, low), (1.0, high)):
+        weight = torch.from_numpy(np.polynomial.legendre.legvander(np.array([end]), points - 1)[0] @ inverse)
+        expected = torch.einsum("n,bnr->br", weight, integrand)
+        is_border = (peak_coordinates.unsqueeze(1) == border)[..., 0]
+        unlike = torch.maximum(unlike, torch.where(is_border, (at_peak - expected).abs(), 0.0).amax(0))
+    return unlike.clamp(max=1.0)
 
 
 def _highest_polynomials(points: int) -> Tensor:

@@ -19,7 +19,7 @@ from framework.testing.devices import Calls, OneDevice, check_devices
 from framework.testing.finding import SEED, Finding, Worst, seed
 from framework.testing.gradients import gradient, mean_gradient_is_zero
 from framework.testing.head_subject import HeadSubject, as_type, seeded
-from framework.testing.precision import precision, reference
+from framework.testing.precision import LIMIT, precision, reference
 from framework.testing.protocol_checks import protocol_calls
 from framework.testing.units import TOLERANCE, units
 from framework.uncertainty import Uncertainty
@@ -54,7 +54,7 @@ def examine_head(subject: HeadSubject) -> Iterator[Finding]:
         ("target's unit", TOLERANCE, units),
         ("loss gradient", 1e-6, gradient),
         ("loss is least for its own density", 6.0, mean_gradient_is_zero),
-        ("float32 against float64", 32.0, precision),
+        ("float32 against float64", LIMIT, precision),
         ("log_prob, float64", 1e-12, lambda subject, worst: reference(subject, worst, torch.float64)),
         ("log_prob, float32", 2e-6, lambda subject, worst: reference(subject, worst, torch.float32)),
     )
