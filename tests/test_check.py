@@ -37,7 +37,7 @@ def test_torchs_von_mises_fails_and_the_table_says_where(framework: Framework) -
     assert expected <= failed
     findings = (done.folder / "check.csv").read_text(encoding="utf-8")
     # its sampler hangs at large concentrations
-    assert "finite for any raw parameters,TooSlow: did not end within 20 s" in findings
+    assert "finite for any raw parameters,TooSlow: the call did not end within 20 s" in findings
     assert "Traceback" not in done.out
 
 

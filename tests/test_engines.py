@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from framework.reports.table import COST_COLUMNS
-from tests.conftest import wait_for
+from tests.conftest import PATIENCE, wait_for
 from tests.slurm_cluster import SlurmCluster, missing_programs
 from tests.test_pool import ROOT, App
 
@@ -132,7 +132,7 @@ def test_ctrl_c_stops_waiting_and_running_jobs_of_slurm(app: App) -> None:
     app.until_ready(0, 1)
     wait_for(lambda: app.record(2).get("handle") is not None)
     process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=60) == 130, app.said()
+    assert process.wait(timeout=PATIENCE) == 130, app.said()
     assert [app.record(job)["status"] for job in range(3)] == ["died"] * 3
     assert [app.record(job)["error"] for job in range(2)] == ["stopped by SIGTERM"] * 2
     assert app.record(2)["error"].startswith("ended by SLURM: CANCELLED")
@@ -214,7 +214,7 @@ def test_a_signal_ends_the_tasks_of_ray(ray_app: App) -> None:
     process = ray_app.start("-m", ray_app.chosen, "what=hold", "x=0,1", "hydra.launcher.jobs=1")
     ray_app.until_ready(0)
     process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=60) == 130, ray_app.said()
+    assert process.wait(timeout=PATIENCE) == 130, ray_app.said()
     assert [ray_app.record(job)["status"] for job in range(2)] == ["died", "queued"]
     assert (ray_app.sweep / "0" / "closed SIGTERM").exists()
 
