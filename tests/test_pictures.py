@@ -26,6 +26,7 @@ from framework.reports.tradeoff_picture import Floor, error_against_run_time
 from framework.reports.training_curve import training_curve
 from framework.reports.viewing_circles import RING, choose, count_peaks, outer_density, viewing_circles
 from framework.sweeps import comparison
+from framework.sweeps.results import Comparison, comparison_figure
 from plugins.density_head.von_mises.density import VonMises
 
 ANGLES = -math.pi + 2 * math.pi / 720 * np.arange(720)
@@ -605,7 +606,10 @@ def test_a_sweep_is_drawn_as_its_jobs_are_and_names_data_machine_and_what_was_va
     by = ["method", "data", "mlp.widths"]
     for data in (("faces",), ("faces", "cells")):
         some = [row for row in rows if row["data"] in data]
-        (path,) = comparison._draw_comparison(aggregate(some, by), some, by, tmp_path)
+        compared = Comparison(some, aggregate(some, by), by, [], {"nll": "NLL (nats)"}, {"nll": "lower"})
+        figure = comparison_figure(compared)
+        assert figure is not None
+        path = comparison._save(figure, compared, tmp_path)
         assert path.name == f"comparison.{suffix}"
         if suffix == "svg":
             said = " ".join(re.findall("<!-- (.*?) -->", path.read_text(encoding="utf-8"), re.S))

@@ -14,8 +14,8 @@ from framework.datasets.scan_layout import read_cameras
 from framework.errors import UserError
 from framework.runs.job import RECORD, VALUE, read_record
 from framework.storage.plain_values import read_yaml
-from framework.sweeps.comparison import _results
 from framework.sweeps.jobs import Job
+from framework.sweeps.results import read_results
 from framework.tracking.journal import _record
 from framework.tracking.run_info import SIDECAR, RunInfo, read_run_info
 from plugins.renderer.rasterizer.gltf import read as read_gltf
@@ -94,7 +94,7 @@ def results(folder: Path, value: Any, key: str) -> Any:
     """Read the results of a job in which `key` has `value`; unreadable results are left out with a warning."""
     found = {"method": "a", "data": "b", "columns": {"nll": "NLL"}, "better": {}, "nll": 1.0, "seed": 0}
     written(folder / "results.json", {**found, "device": "cpu", "threads": 1, key: value})
-    read = _results(folder)
+    read = read_results(folder)
     if not read:
         raise UserError("left out")
     return read

@@ -114,6 +114,7 @@ COMMANDS: dict[str, Sequence[str]] = {
     "check": ("data=moons",),
     "plugins": (),
     "new": ("mode.plugin=density_head/my_head", "mode.folder={new}"),
+    "report": ("mode.run={train}", "mode.into={report}"),
     "sync": ("mode.run={train}",),
 }
 """Working command for each mode; `{mode}` is the folder of an earlier run of that mode."""

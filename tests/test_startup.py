@@ -56,6 +56,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "check": ("metric=[accuracy]", "torchmetrics"),
     "plugins": ("", ""),
     "new": ("mode.plugin=density_head/my_head", ""),
+    "report": ("mode.run=train", "matplotlib"),
     "sync": ("mode.run=train", ""),
 }
 """Settings of a command for each mode, and the slow packages that this command needs besides torch."""

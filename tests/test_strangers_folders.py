@@ -32,6 +32,7 @@ COMMANDS: dict[str, list[str]] = {
     "test": ["mode=test", "checkpoint={run}", "logger=none"],
     "predict": ["mode=predict", "checkpoint={run}", "logger=none"],
     "export": ["mode=export", "checkpoint={run}", "logger=none"],
+    "report": ["mode=report", "mode.run={run}"],
     "work_precision": ["mode=work_precision", "checkpoint={run}", "logger=none"],
     "combine": ["mode=combine", "mode.members={sweep}", "logger=none"],
     "train from it": [*TINY, "trainer.max_epochs=1", "checkpoint={run}", "logger=none"],

@@ -48,6 +48,7 @@ MODES: Mapping[str, Mode] = {
     "check": Mode((*BUNDLES, *GROUPS)),
     "plugins": Mode(),
     "new": Mode(),
+    "report": Mode(),
     "sync": Mode(),
 }
 """Keys that each mode reads, by the name of the mode."""

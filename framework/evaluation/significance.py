@@ -113,3 +113,58 @@ def significantly_best(
         ahead = values[:, None] - values > least_significant(means)
     np.fill_diagonal(ahead, True)
     return np.logical_and(ahead.all(1), len(means) > 1)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Mean difference of paired numbers, such as the results of two methods with the same seeds.
+
+    Attributes:
+        value: the mean difference.
+        standard_error: standard error of the mean difference; NaN for fewer than two pairs.
+        probability: two-sided probability of so large a difference between equal methods, by Student's t-test for
+            pairs; NaN for fewer than two pairs.
+        pairs: number of pairs.
+    """
+
+    value: float
+    standard_error: float
+    probability: float
+    pairs: int
+
+
+def paired_difference(first: Sequence[float], second: Sequence[float]) -> Difference:
+    """Return the mean of first - second over pairs, with its standard error and its probability.
+
+    If all differences are equal, the standard error is 0; the probability is then 0, or 1 if the differences are 0.
+    """
+    from scipy.special import stdtr
+
+    differences = np.asarray(first, np.float64) - np.asarray(second, np.float64)
+    count = len(differences)
+    value = float(differences.mean()) if count else math.nan
+    if count < 2:
+        return Difference(value, math.nan, math.nan, count)
+    error = float(differences.std(ddof=1)) / math.sqrt(count)
+    if error == 0:
+        return Difference(value, 0.0, 1.0 if value == 0 else 0.0, count)
+    return Difference(value, error, float(2 * stdtr(count - 1, -abs(value) / error)), count)
+
+
+def holm(probabilities: Sequence[float]) -> list[float]:
+    """Return the probabilities of several tests, corrected for their number; NaN stays NaN and is not counted.
+
+    A test is significant at 5 % if its corrected probability is at most 0.05. The probability that any test of equal
+    methods is significant is then at most 5 % (S. Holm (1979), "A simple sequentially rejective multiple test
+    procedure", Scandinavian Journal of Statistics 6, 65-70).
+    """
+    order = sorted(
+        (index for index, value in enumerate(probabilities) if not math.isnan(value)),
+        key=probabilities.__getitem__,
+    )
+    corrected = [math.nan] * len(probabilities)
+    largest = 0.0
+    for rank, index in enumerate(order):
+        largest = max(largest, min(1.0, (len(order) - rank) * probabilities[index]))
+        corrected[index] = largest
+    return corrected

@@ -4,6 +4,7 @@ import textwrap
 from pathlib import Path
 
 from matplotlib import rc_context
+from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -17,9 +18,18 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*")
 GREY = "0.4"
 
 
+class _PlainFigure(Figure):
+    """Figure that draws every text as it is: names of users' methods and classes may hold the sign of TeX, $."""
+
+    def draw(self, renderer: RendererBase) -> None:
+        for text in self.findobj(Text):
+            text.set_parse_math(False)
+        super().draw(renderer)
+
+
 def titled_figure(size: tuple[float, float], title: str, synthetic: bool) -> Figure:
     """Return an empty figure of `size` in inches; its title says if the data are synthetic."""
-    figure = Figure(figsize=size, dpi=150, layout="constrained")
+    figure = _PlainFigure(figsize=size, dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
     if synthetic and "synthetic" not in title.lower():
         title = f"{title} (synthetic data)"

@@ -13,6 +13,7 @@ from framework.evaluation.cost import Cost
 from framework.evaluation.splits import Evaluation, cost, evaluate
 from framework.metric import HasFigure
 from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, machine, results_table
+from framework.runs.provenance import package_versions
 from framework.runs.run import Run
 from framework.runs.session import Session
 from framework.storage.files import write_whole
@@ -118,6 +119,7 @@ def _results(
         "columns": columns,
         "better": better,
         "folder": str(run.folder),
+        "versions": package_versions(),
     }
 
 

@@ -1,10 +1,11 @@
-"""Result tables: numbers with their errors, for the terminal, in Markdown and as CSV."""
+"""Result tables: numbers with their errors, for the terminal, in Markdown, HTML and LaTeX, and as CSV."""
 
 import math
 import re
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from csv import writer
+from html import escape
 from numbers import Integral
 from pathlib import Path
 from typing import Literal, SupportsFloat
@@ -41,7 +42,7 @@ COST_BETTER: Better = dict.fromkeys(COST_COLUMNS, "lower")
 """Direction in which costs are better, by the keys of COST_COLUMNS."""
 NOT_AVAILABLE = "not available"
 NO_BREAK = "\u00a0"
-WIDTH = 100
+WIDTH = 80
 """Width of a line of the terminal, in characters, into which a table should fit."""
 SPREADS = {"_std": "standard deviation over runs", "_sem": "standard error of the mean"}
 """Meaning of the numbers after ±, by the suffix of their keys."""
@@ -86,6 +87,53 @@ def markdown(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better 
     text = "".join(f"| {' | '.join(line)} |\n" for line in [cells[0], rule, *cells[1:]])
     caption = _caption(rows, columns, lines)
     return f"{text}\n{caption}\n" if caption else text
+
+
+def html(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | None = None) -> str:
+    """Return a table of the results in HTML, whose cells hold the numbers by which a script may sort them.
+
+    If any result is synthetic, a column says which ones are.
+    """
+    lines = _lines(rows, columns, better or {}, origin=any(map(_synthetic, rows)))
+    arrows = [{"higher": " ↑", "lower": " ↓"}.get((better or {}).get(key, ""), "") for key in columns]
+    heads = "".join(
+        f"<th>{escape(head.plain)}{arrow}</th>"
+        for head, arrow in zip(lines[0], [*arrows, *[""] * (len(lines[0]) - len(arrows))], strict=True)
+    )
+    body = ""
+    for row, line in zip(rows, lines[1:], strict=True):
+        numbers = [*(_number(row.get(key)) for key in columns), *[None] * (len(line) - len(columns))]
+        sort_keys = ("" if number is None else f' data-value="{number!r}"' for number in numbers)
+        cells = (
+            f"<td{sort_key}>{_bold_html(cell)}</td>" for sort_key, cell in zip(sort_keys, line, strict=True)
+        )
+        body += f"<tr>{''.join(cells)}</tr>\n"
+    caption = _caption(rows, columns, lines)
+    note = f"<caption>{escape(caption)}</caption>" if caption else ""
+    return f"<table>{note}<thead><tr>{heads}</tr></thead>\n<tbody>\n{body}</tbody></table>\n"
+
+
+def latex(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | None = None) -> str:
+    """Return a table of the results in LaTeX, which needs no package.
+
+    If any result is synthetic, a column says which ones are.
+    """
+    lines = _lines(rows, columns, better or {}, origin=any(map(_synthetic, rows)))
+    head, *body = (" & ".join(_latex_cell(cell) for cell in line) + r" \\" for line in lines)
+    caption = _caption(rows, columns, lines)
+    return "\n".join(
+        [
+            rf"\begin{{tabular}}{{l{'r' * (len(lines[0]) - 1)}}}",
+            r"\hline",
+            head,
+            r"\hline",
+            *body,
+            r"\hline",
+            r"\end{tabular}",
+            *([f"% {caption}"] if caption else []),
+            "",
+        ]
+    )
 
 
 def write_csv(rows: Sequence[Row], columns: Iterable[str] | None, path: Path) -> None:
@@ -225,7 +273,7 @@ def _lines(
                 lines[row_index][index].stylize("bold")
     heads = [Text(head) for head in columns.values()]
     if origin:
-        heads.append(Text("data"))
+        heads.append(Text("origin" if "data" in columns.values() else "data"))
         for row, line in zip(rows, lines, strict=True):
             line.append(Text("synthetic" if _synthetic(row) else "real"))
     return [heads, *lines]
@@ -312,6 +360,41 @@ def _wrap(heading: str, width: int) -> str:
 def _escape(cell: Text) -> str:
     text = cell.plain.replace("|", "\\|").replace("\n", " ")
     return f"**{text}**" if cell.spans else text
+
+
+def _bold_html(cell: Text) -> str:
+    text = escape(cell.plain)
+    return f"<b>{text}</b>" if cell.spans else text
+
+
+_LATEX = {
+    **{sign: rf"\{sign}" for sign in "&%$#_{}"},
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "±": r"$\pm$",
+    "°": r"$^\circ$",
+    "−": "$-$",
+    "×": r"$\times$",
+    "≤": r"$\leq$",
+    "≥": r"$\geq$",
+    "·": r"$\cdot$",
+    "²": "$^2$",
+    "³": "$^3$",
+    "κ": r"$\kappa$",
+    "μ": r"$\mu$",
+    "µ": r"$\mu$",
+    "σ": r"$\sigma$",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "\n": " ",
+}
+"""Signs of tables → LaTeX."""
+
+
+def _latex_cell(cell: Text) -> str:
+    text = "".join(_LATEX.get(letter, letter) for letter in cell.plain)
+    return rf"\textbf{{{text}}}" if cell.spans else text
 
 
 def _aggregate_group(members: Sequence[Row], by: Sequence[str], over: str) -> dict[str, object]:

@@ -5,36 +5,35 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from framework.configuration.settings import store_experiment
-from framework.errors import ConfigError, DataError, did_you_mean, escape_unprintable, quote, shorten
+from framework.errors import ConfigError, did_you_mean
 from framework.reports.table import (
     COST_BETTER,
     COST_COLUMNS,
     Better,
-    aggregate,
-    machine,
     markdown,
     results_table,
     write_csv,
 )
 from framework.runs.job import find_job_folders, read_record
 from framework.runs.resuming import stored_config
-from framework.storage.plain_values import is_number, read_json
+from framework.storage.plain_values import is_number
 from framework.storage.progress import output
-from framework.storage.reading import RESTORE
+from framework.sweeps.results import Comparison, compare, comparison_figure, job_results, read_results
 from framework.tracking.ended import close_and_send
 from framework.tracking.run_info import Destination, RunInfo, read_run_info
 from framework.tracking.tracker import MlflowTracker, mlflow_store
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _DIRECTIONS: Mapping[str, Literal["higher", "lower"]] = {"minimize": "lower", "maximize": "higher"}
 DESCRIPTION, LONGEST_DESCRIPTION = "mlflow.note.content", 7500
 """Tag that MLflow shows as a run's description, and the largest number of characters of a description."""
 RETURNED = "best validation loss (nats)"
 """Name, in tables, of the value that a training returns to its sweep."""
-_HEADER = ("method", "data", "columns", "better")
-"""Keys that results.json of a job must contain so that the job appears in the table."""
 
 _log = logging.getLogger(__name__)
 
@@ -85,32 +84,25 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]], config: Mapping[
     for job in jobs:
         if _status(job) == "died" and (job / "run.json").is_file():
             close_and_send(job, store_of(config))  # a killed process cannot close its run
-    rows = [row for row in map(_row, jobs) if row]
     files: list[Path] = []
     summary = ""
-    if rows:
-        # Jobs of other commands in this folder count too, because every key that distinguishes rows must be shown.
-        all_overrides = [*overrides, *(row["overrides"] for row in rows)]
-        keys = _varied_keys(all_overrides)
-        if _has_repetition(rows, keys):  # some commands do not have the setting
-            keys = _varied_keys(all_overrides, absent=True)
-        rows = [{**dict.fromkeys(keys), **row} for row in rows]
-        shown = (key for key in keys if key not in ("seed", "experiment") and not _repeats_data(rows, key))
-        by = ["method", "data", *shown]
-        columns = {key: key.rpartition(".")[2] for key in by} | rows[0]["columns"] | COST_COLUMNS
-        # Columns without any number are left out.
-        columns = {
-            key: heading for key, heading in columns.items() if any(row.get(key) is not None for row in rows)
-        }
-        compared = aggregate(rows, by=by, over="seed")
-        better = rows[0]["better"]
-        console.print(results_table(compared, columns, title=f"{len(rows)} runs in {folder}", better=better))
-        write_csv(compared, columns, folder / "comparison.csv")
-        files.append(folder / "comparison.csv")
-        files.extend(_draw_comparison(compared, rows, by, folder))
+    compared = compare(job_results(jobs), overrides)
+    if compared:
+        from framework.sweeps.pages import failed_jobs, save_report
+
+        title = f"{len(compared.runs)} runs in {folder}"
+        better, columns = compared.better, compared.columns
+        console.print(results_table(compared.rows, columns, title=title, better=better))
+        write_csv(compared.rows, columns, folder / "comparison.csv")
+        figure = comparison_figure(compared)
+        files = [folder / "comparison.csv", *([] if figure is None else [_save(figure, compared, folder)])]
         console.print(f"comparison: {', '.join(str(file) for file in files)}", soft_wrap=True)
-        table = markdown(compared, columns, better=better)
-        summary = f"{len(rows)} runs over {', '.join(keys) or 'nothing'}.\n\n{table}"
+        report = save_report(folder, compared, failed_jobs(jobs), figure, folder)
+        console.print(f"report:     {report[0]}", soft_wrap=True)
+        files += report
+        varied = ", ".join(compared.varied) or "nothing"
+        table = markdown(compared.rows, columns, better=better)
+        summary = f"{len(compared.runs)} runs over {varied}.\n\n{table}"
     _close_parent(folder, files, summary, config)
 
 
@@ -141,7 +133,7 @@ def rank(
     Raises:
         ConfigError: No trial has the metric, or its direction is not known.
     """
-    results = {trial.folder: _results(trial.folder) if trial.completed else {} for trial in trials}
+    results = {trial.folder: read_results(trial.folder) if trial.completed else {} for trial in trials}
     known = [result for result in results.values() if result]
     heading, better = RETURNED, _DIRECTIONS[direction or "minimize"]
     if metric is not None:
@@ -194,51 +186,6 @@ def close_ranking(folder: Path, summary: str, config: Mapping[str, Any]) -> None
     _close_parent(folder, [path for path in paths if path.is_file()], summary, config)
 
 
-def _results(job: Path) -> dict[str, Any]:
-    """Return the results of a job; if they cannot be read, log a warning and return an empty dictionary."""
-    path = job / "results.json"
-    if not path.is_file():
-        return {}
-    try:
-        results = read_json(path, "the results of a job")
-        if lacking := [key for key in _HEADER if key not in results]:
-            raise DataError(f"{path} lacks {', '.join(lacking)}. {RESTORE}")
-        return _check_results(results, path)
-    except DataError as error:
-        _log.warning("A job is missing in the table: %s", error)
-        return {}
-
-
-def _check_results(results: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Check a job's results, which may come from an untrusted source; return them with texts that are safe to print.
-
-    Raises:
-        DataError: A value has a type that no test writes.
-    """
-    columns, better = results["columns"], results["better"]
-    valid = {
-        "method": isinstance(results["method"], str),
-        "data": isinstance(results["data"], str),
-        "seed": isinstance(results.get("seed"), int | str | None)
-        and not isinstance(results.get("seed"), bool),
-        "device": isinstance(results.get("device"), str | None),
-        "threads": type(results.get("threads")) is int or "device" not in results,
-        "columns": isinstance(columns, dict)
-        and all(isinstance(heading, str) for heading in columns.values()),
-        "better": isinstance(better, dict)
-        and all(direction in ("higher", "lower") for direction in better.values()),
-        **{key: results[key] is None or is_number(results[key]) for key in COST_COLUMNS if key in results},
-    }
-    if isinstance(columns, dict):
-        valid |= {key: results[key] is None or is_number(results[key]) for key in columns if key in results}
-    if invalid := [key for key, is_valid in valid.items() if not is_valid]:
-        raise DataError(
-            f"{path} has the invalid value {shorten(invalid[0])} = {quote(results.get(invalid[0]))}. {RESTORE}"
-        )
-    plain = {key: shorten(value) if isinstance(value, str) else value for key, value in results.items()}
-    return {**plain, "columns": {key: shorten(heading) for key, heading in columns.items()}}
-
-
 def _trial_row(
     trial: Trial, results: Mapping[str, Any], keys: Sequence[str], metric: str | None
 ) -> dict[str, Any]:
@@ -282,88 +229,14 @@ def _status(folder: Path) -> str:
     return read_record(folder).get("status", "")
 
 
-def _row(job: Path) -> dict[str, Any] | None:
-    """Return a job's row of the table; None if the job did not complete or its results cannot be read."""
-    record = read_record(job)
-    results = _results(job) if record.get("status") == "completed" else {}
-    if not results:
-        return None
-    overrides = [escape_unprintable(override, allowed="") for override in record["overrides"]]
-    swept = dict(override.lstrip("+~").split("=", 1) for override in overrides if "=" in override)
-    row = {**swept, **results, "overrides": overrides, "folder": str(job)}
-    if "batch_size" in swept:
-        # In the results, batch_size is that of the cost measurement, which a small test split limits.
-        row["batch_size"] = swept["batch_size"]
-    return row
-
-
-def _varied_keys(overrides: Sequence[Sequence[str]], *, absent: bool = False) -> list[str]:
-    """Return the keys with several values among the jobs, in order; with `absent`, also keys that some jobs lack."""
-    values_of: dict[str, list[str]] = {}
-    for job in overrides:
-        for override in job:
-            key, _, value = override.lstrip("+~").partition("=")
-            values_of.setdefault(key, []).append(value)
-    return [
-        key
-        for key, values in values_of.items()
-        if len(set(values)) > 1 or (absent and len(values) < len(overrides))
-    ]
-
-
-def _has_repetition(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> bool:
-    """Return whether two rows agree in the method, the data, the seed and the values of `keys`."""
-    combinations = [tuple(row.get(key) for key in ("method", "data", "seed", *keys)) for row in rows]
-    return len(set(combinations)) < len(combinations)
-
-
-def _repeats_data(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
-    """Return whether the column `key` has several values, but only one for each value of the column `data`."""
-    pairs = {(row["data"], row[key]) for row in rows}
-    return len({value for _, value in pairs}) > 1 and len({data for data, _ in pairs}) == len(pairs)
-
-
-def _draw_comparison(
-    compared: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]], by: Sequence[str], folder: Path
-) -> list[Path]:
-    """Draw the first column with a known direction against run time; return the files, none if a row lacks a number.
-
-    Args:
-        compared: Means of the `rows`, one row for each combination of values of the keys `by`.
-        rows: Results of the jobs.
-        by: "method", "data" and the keys that were varied.
-        folder: Folder of the sweep.
-    """
+def _save(figure: "Figure", compared: Comparison, folder: Path) -> Path:
+    """Save the figure of a comparison in the folder of the sweep, in the format of its jobs' settings."""
     from framework.figures.style import save_figure
-    from framework.reports.tradeoff_picture import error_against_run_time
 
-    headings, better = rows[0]["columns"], rows[0]["better"]
-    key = next((key for key in headings if key in better), None)
-    if key is None or not all(key in row for row in compared) or not all("device" in row for row in rows):
-        return []
-    method, data, *varied = by
-    names = [
-        [row[method], *(f"{name.rpartition('.')[2]}={row[name]}" for name in varied if row[name] is not None)]
-        for row in compared
-    ]
-    several = len({row[data] for row in compared}) > 1
-    data_title = f"{len({row[data] for row in compared})} data sets" if several else compared[0][data]
-    figure = error_against_run_time(
-        [{**row, "method": ", ".join(words)} for row, words in zip(compared, names, strict=True)],
-        {key: headings[key]},
-        better,
-        title=f"{data_title}: {headings[key]} against run time",
-        synthetic=any(row.get("synthetic") for row in compared),
-        machine="; ".join(dict.fromkeys(machine(row["device"], row["threads"]) for row in rows)),
-        group=data if several else None,
-    )
-    stored = stored_config(Path(rows[0]["folder"]))
+    stored = stored_config(Path(compared.runs[0]["folder"]))
     pictures = stored.get("pictures", True) if isinstance(stored, dict) else True
-    return [
-        save_figure(
-            figure, folder / "comparison", pictures if pictures in ("png", "pdf", "svg", False) else True
-        )
-    ]
+    kind = pictures if pictures in ("png", "pdf", "svg", False) else True
+    return save_figure(figure, folder / "comparison", kind)
 
 
 def _parent(
