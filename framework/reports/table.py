@@ -61,12 +61,14 @@ def results_table(
         columns: headings by key, in order; the first column names the result.
         title: title above the table. If all results are synthetic, "(synthetic data)" is added to it; if only some are,
             a further column says which.
-        better: directions of the columns in which the best number may be bold; a single result is never bold.
+        better: directions of the columns in which the best number may be bold; a single result is never bold. Headings
+            have arrows in these directions. None: the arrows are those of the first row's "better", if it has one.
     """
     synthetic = [_synthetic(row) for row in rows]
     if rows and all(synthetic) and "synthetic" not in title.lower():
         title = f"{title} (synthetic data)"
     lines = _lines(rows, columns, better or {}, origin=any(synthetic) and not all(synthetic))
+    _add_arrows(lines[0], columns, better or (rows[0].get("better") if rows else None))
     transposed = [list(line) for line in zip(*lines, strict=True)]
     if _width(lines) > WIDTH and _width(transposed) < _width(lines):
         lines = transposed
@@ -77,6 +79,14 @@ def results_table(
     for line in lines[1:]:
         table.add_row(*line)
     return table
+
+
+def _add_arrows(heads: Sequence[Text], columns: Mapping[str, str], better: object) -> None:
+    """Add ↑ to headings of columns in which higher is better, and ↓ where lower is better."""
+    if isinstance(better, Mapping):
+        ways = {**COST_BETTER, **better}
+        for head, key in zip(heads, columns, strict=False):
+            head.append({"higher": " ↑", "lower": " ↓"}.get(ways.get(key, ""), ""))
 
 
 def markdown(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | None = None) -> str:
@@ -95,11 +105,8 @@ def html(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | No
     If any result is synthetic, a column says which ones are.
     """
     lines = _lines(rows, columns, better or {}, origin=any(map(_synthetic, rows)))
-    arrows = [{"higher": " ↑", "lower": " ↓"}.get((better or {}).get(key, ""), "") for key in columns]
-    heads = "".join(
-        f"<th>{escape(head.plain)}{arrow}</th>"
-        for head, arrow in zip(lines[0], [*arrows, *[""] * (len(lines[0]) - len(arrows))], strict=True)
-    )
+    _add_arrows(lines[0], columns, better)
+    heads = "".join(f"<th>{escape(head.plain)}</th>" for head in lines[0])
     body = ""
     for row, line in zip(rows, lines[1:], strict=True):
         numbers = [*(_number(row.get(key)) for key in columns), *[None] * (len(line) - len(columns))]

@@ -14,6 +14,8 @@ from framework.prediction import Prediction
 from framework.target import Target
 
 BEYER = "beyer2015biternion"
+FEW = 3
+"""Largest number of angles for which the deviation of each angle is in the result table."""
 
 
 class MeanAngularDeviation(Mean):
@@ -21,7 +23,8 @@ class MeanAngularDeviation(Mean):
 
     The deviation of a sample is the mean over its angles, and `maad_deg` is the mean deviation over samples, with its
     standard error. `maad_<angle>_deg` is the mean deviation of one angle. The point prediction is the value with the
-    smallest expected deviation under the density (thesis eq. 3.23 and 3.24).
+    smallest expected deviation under the density (thesis eq. 3.23 and 3.24). For two or three angles, the result table
+    shows the deviation of each angle beside the mean.
 
     Raises:
         ConfigError: the target does not consist of angles.
@@ -35,6 +38,8 @@ class MeanAngularDeviation(Mean):
         super().__init__()
         target.require("angle", by="angular_deviation")
         self.names = ("maad_deg", *(f"maad_{name}_deg" for name in target.names))
+        if 1 < len(target.names) <= FEW:  # the mean alone would hide the angle with the largest error
+            self.columns = {**self.columns, **{f"maad_{name}_deg": f"{name} MAAD °" for name in target.names}}
         self.start(len(self.names))
 
     def update(self, prediction: Prediction) -> None:

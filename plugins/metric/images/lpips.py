@@ -35,7 +35,7 @@ class LPIPS(PerImage):
 
     bibtex = "zhang2018unreasonable"
     reads: ClassVar[frozenset[str]] = frozenset({"color"})
-    columns: ClassVar[dict[str, str]] = {"lpips": "LPIPS", "lpips_masked": "inside"}
+    columns: ClassVar[dict[str, str]] = {"lpips": "LPIPS", "lpips_masked": "LPIPS in mask"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "lower")
     figure_name: ClassVar[str] = "lpips"
 

@@ -51,7 +51,7 @@ class PSNR(PerImage):
 
     bibtex = "huynhthu2008scope"
     reads: ClassVar[frozenset[str]] = frozenset({"color"})
-    columns: ClassVar[dict[str, str]] = {"psnr_db": "PSNR dB", "psnr_masked_db": "inside dB"}
+    columns: ClassVar[dict[str, str]] = {"psnr_db": "PSNR dB", "psnr_masked_db": "PSNR in mask, dB"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "higher")
     figure_name: ClassVar[str] = "psnr"
 
@@ -91,7 +91,7 @@ class SSIM(PerImage):
 
     bibtex = "wang2004image"
     reads: ClassVar[frozenset[str]] = frozenset({"color"})
-    columns: ClassVar[dict[str, str]] = {"ssim": "SSIM", "ssim_masked": "inside"}
+    columns: ClassVar[dict[str, str]] = {"ssim": "SSIM", "ssim_masked": "SSIM in mask"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "higher")
     figure_name: ClassVar[str] = "ssim"
 

@@ -56,9 +56,9 @@ class PixelUncertainty(Metric, HasFigure):
     bibtex = "czado2009predictive"
     columns: ClassVar[dict[str, str]] = {
         "pixel_coverage_90": "pixels in 90 %",
-        "pixel_coverage_90_masked": "inside",
+        "pixel_coverage_90_masked": "in 90 %, in mask",
         "spearman": "error by scale",
-        "spearman_masked": "inside",
+        "spearman_masked": "error by scale, in mask",
     }
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {
         "spearman": "higher",
