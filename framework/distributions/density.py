@@ -14,6 +14,7 @@ from framework.distributions.circular import Circular, circular, grid
 from framework.distributions.description import one_line
 from framework.distributions.highest import crossings, highest
 from framework.distributions.many_components import FEWEST, likeliest_modes
+from framework.distributions.medians import median_of_real
 from framework.distributions.panels import entropy_of_one, has_range
 from framework.distributions.picked import PickedMixture
 
@@ -276,7 +277,9 @@ def _(density: Mixture, index: int) -> Distribution:
 
 @protocol.median.register
 def _(density: Mixture, samples: int) -> Tensor:
-    """Return the median of a single component; for several components, the median of draws (the default of `median`).
+    """Return the median of a single component, or of several over one real number whose distribution function is known.
+
+    For all others it is the median of draws (the default of `median`).
 
     For several components over images the mean is returned, as `framework.deployment.frozen.Frozen` does: the median of
     few draws is a noisy image, and the median from the distribution function takes a second of processor time.
@@ -285,6 +288,10 @@ def _(density: Mixture, samples: int) -> Tensor:
         return protocol.median(density.components, samples).squeeze(-1 - len(density.event_shape))
     if len(density.event_shape) == 3:
         return density.mean
+    if tuple(density.event_shape) == (1,) and not isinstance(density.support, Circular):
+        exact = median_of_real(density)
+        if exact is not None:
+            return exact
     return protocol.median.dispatch(Distribution)(density, samples)
 
 

@@ -21,8 +21,6 @@ DRAWS = 4096
 """Number of draws of an estimated entropy; it is printed with its standard error."""
 STEPS = 200
 """Largest number of steps of the search for a mode and of a bisection."""
-_REACH = 40.0
-"""Distance from a peak, in widths of the peak, up to which the density of one number is integrated."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 
 
@@ -59,11 +57,14 @@ class Density:
         batch: shape of the batch.
         event: shape of one target; () for classes.
         circular: whether the target consists of angles.
+        reach: distance from a peak, in widths of the peak, up to which the density of one number is integrated; larger
+            for heavy tails.
     """
 
     batch: tuple[int, ...]
     event: tuple[int, ...]
     circular: bool = False
+    reach: float = 40.0
 
     def log_prob(self, value: Array) -> Array:
         """Return the log-density at `value` (*sample, *batch, *event), (*sample, *batch), nats."""
@@ -133,7 +134,9 @@ class Density:
         a constant factor.
         """
         place, width = self.peaks()
-        steps = np.concatenate([[0.0], np.geomspace(0.5, _REACH, 8)])
+        steps = np.concatenate(
+            [[0.0], np.geomspace(0.5, self.reach, math.ceil(4.9 * math.log10(self.reach)))]
+        )
         steps = np.concatenate([-steps[:0:-1], steps])
         edges = (place + width * steps.reshape(-1, *(1,) * place.ndim)).reshape(-1, *self.batch)
         if self.circular:
@@ -415,6 +418,7 @@ class Mixture(Density):
     def __init__(self, log_weights: Array, components: Density) -> None:
         self.log_weights = log_weights - log_sum_exp(log_weights)[..., None]
         self.components = components
+        self.reach = components.reach
         self.batch, self.event, self.circular = components.batch[:-1], components.event, components.circular
 
     @property
@@ -504,6 +508,7 @@ class Stacked(Density):
     def __init__(self, densities: Sequence[Density]) -> None:
         first = densities[0]
         self.densities = densities
+        self.reach = max(density.reach for density in densities)
         self.batch, self.event, self.circular = (*first.batch, len(densities)), first.event, first.circular
 
     @property
@@ -577,7 +582,7 @@ class Affine(Density):
 
     def __init__(self, location: Array, scale: Array, inner: Density) -> None:
         self.location, self.scale, self.inner = location, scale, inner
-        self.batch, self.event = inner.batch, inner.event
+        self.batch, self.event, self.reach = inner.batch, inner.event, inner.reach
 
     def log_prob(self, value: Array) -> Array:
         return self.inner.log_prob((value - self.location) / self.scale) - np.log(self.scale).sum(-1)

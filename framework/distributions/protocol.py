@@ -266,6 +266,16 @@ def marginal_cdfs(density: Distribution, value: Tensor) -> Tensor | None:
 
 
 @singledispatch
+def crps(density: Distribution, value: Tensor) -> Tensor | None:
+    """Return the continuous ranked probability score of a density of one real number at `value` y (*batch, 1).
+
+    The score E|X - y| - ½ E|X - X'| (Gneiting & Raftery 2007, eq. 21) is float64, (*batch), in the unit of the number.
+    Default: None, no formula is known. The metric `crps` then knows the scores of normals, and uses draws otherwise.
+    """
+    return None
+
+
+@singledispatch
 def arc_probability(density: Distribution, start: Tensor, end: Tensor) -> Tensor | None:
     """Return the probability of the arc from `start` counter-clockwise to `end` for one angle; None if unknown.
 

@@ -11,6 +11,7 @@ from torch.nn.functional import hardtanh, mse_loss
 
 from framework.density_head import DensityHead
 from framework.heads.parameters import require_finite, require_validation
+from framework.heads.scales import scale_of_raw
 from framework.heads.unit import Unit
 from framework.storage.weights import require_state
 from framework.target import Target
@@ -18,7 +19,6 @@ from plugins.density_head.gaussian.density import Gaussian
 
 LARGEST_MEAN = 1e8
 """Bound to which means are clamped, because squares of larger standardised residuals overflow float32."""
-LARGEST_SCALE = 1e12
 WIDEST_SCALE = 1e18
 """Largest standard deviation that calibration sets and that a stored state may hold."""
 LARGEST_COEFFICIENT = 1e3
@@ -121,19 +121,6 @@ class GaussianHead(DensityHead):
         coefficients = raw.new_zeros(*raw.shape[:-1], self.numbers, self.numbers)
         coefficients[..., row, column] = bounded
         return coefficients
-
-
-def scale_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Return the standard deviation for a raw parameter r: σ = exp(r) for r ≤ 0, and σ = (1 + r/4)⁴ for r > 0.
-
-    σ is a smooth function of r, 1 at r = 0, and at most LARGEST_SCALE.
-
-    The Fisher information of log σ is constant, so that a logarithmic map trains best. The fourth power keeps σ from
-    exploding at an outlier.
-    """
-    most = 4 * (LARGEST_SCALE**0.25 - 1)
-    high = (1 + raw.clamp(0.0, most) / 4).square().square()
-    return torch.where(raw < 0, torch.exp(raw.clamp(max=0.0)), high)
 
 
 def fit(

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution
 
+from framework.distributions import protocol
 from framework.distributions.circular import Circular, angular_distance, wrap
 from framework.distributions.circular_moments import circular_moments
 from framework.distributions.density import CHUNK
@@ -37,8 +38,9 @@ def crps(density: Distribution, value: Tensor, samples: int) -> Score:
     """Return the score E|X - y| - ½ E|X - X'| (Gneiting & Raftery 2007, eq. 21); lower is better, 0 is best.
 
     X and X' are independent samples of the density, and y is `value`. For an angle, |·| is the angular distance
-    (Grimit, Gneiting, Berrocal & Johnson 2006, eq. 5). The score is exact for mixtures of up to `MOST` normals, and for
-    angles whose density a grid resolves (`circular_moments`). Otherwise it is the unbiased estimate from `samples`
+    (Grimit, Gneiting, Berrocal & Johnson 2006, eq. 5). The score is exact for densities that register a formula
+    (`protocol.crps`), for mixtures of up to `MOST` normals, and for angles whose density a grid resolves
+    (`circular_moments`). Otherwise it is the unbiased estimate from `samples`
     draws, in `REPLICATES` parts whose spread gives the error.
 
     Args:
@@ -54,6 +56,9 @@ def crps(density: Distribution, value: Tensor, samples: int) -> Score:
             return Score(exact, torch.zeros_like(exact))
         draws = fair_estimate(_draws(density, samples), at, circular=True)
         return Score(*(torch.where(moments.resolved, a, b) for a, b in zip((exact, 0.0), draws, strict=True)))
+    formula = protocol.crps(density, value)
+    if formula is not None:
+        return Score(formula, torch.zeros_like(formula))
     known = normals(density)
     if known is not None and known.mean.shape[-1] <= MOST:
         exact = normal_mixture_score(known, at)

@@ -1,0 +1,1 @@
+"""Student's t densities of real numbers, and their head."""

@@ -1,0 +1,62 @@
+"""Contract-test cases: heads of Student's t, with log-densities from a 50-digit reference."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import mpmath
+import torch
+
+from framework.density_head import DensityHead
+from framework.target import Target
+from framework.testing.rows import Case, HeadRow
+
+ONE = Target("real", ("height",))
+TWO = Target("real", ("x", "y"))
+OFFSETS = (0.0, 1e-6, 1.0, -3.0, 40.0, 1e6)
+
+
+def exact(residual: list[float], scale: Any, freedom: Any) -> Any:
+    """Return the log-density of independent numbers at `residual` from their locations, nats, as an mpmath number."""
+    half = mpmath.mpf(freedom) / 2
+    constant = mpmath.loggamma(half + 0.5) - mpmath.loggamma(half) - mpmath.log(2 * half * mpmath.pi) / 2
+    return sum(
+        constant - mpmath.log(scale) - (half + 0.5) * mpmath.log1p((mpmath.mpf(d) / scale) ** 2 / (2 * half))
+        for d in residual
+    )
+
+
+def map_of_raw(raw: float) -> Any:
+    """Return σ(r) = exp(r) for r < 0 and (1 + r/4)⁴ otherwise, at most 1e12, as an mpmath number."""
+    r = mpmath.mpf(raw)
+    return mpmath.e**r if r < 0 else min((1 + r / 4) ** 4, mpmath.mpf(10) ** 12)
+
+
+def cases(head: DensityHead) -> Iterator[Case]:
+    """Yield cases with location 0, many scales and, where they are predicted, many degrees of freedom."""
+    numbers, predicted, fixed = head.numbers, head.predicted, head.fixed  # type: ignore[attr-defined]
+    for log_scale in (-100.0, -9.0, -1.0, 0.0, 2.0, 40.0, 1e4):
+        for log_freedom in (-100.0, -1.0, 0.0, 3.0, 100.0, 1e4) if predicted else (0.0,):
+            raw = torch.zeros(len(OFFSETS), head.size, dtype=torch.float64)
+            raw[:, numbers : 2 * numbers] = log_scale
+            raw[:, 2 * numbers :] = log_freedom
+            value = torch.tensor(OFFSETS, dtype=torch.float32).double()
+            value = torch.stack([value.roll(number) for number in range(numbers)], -1)
+            with mpmath.workdps(50):
+                scale = mpmath.mpf(head.floor) + map_of_raw(log_scale)  # type: ignore[arg-type]
+                freedom = 3 + min(8 * map_of_raw(log_freedom), mpmath.mpf(10) ** 8) if predicted else fixed
+                log_prob = [float(exact(row, scale, freedom)) for row in value.tolist()]
+            name = f"r = {log_scale:g}" + (f", {log_freedom:g}" if predicted else "")
+            yield Case(name, raw, value, torch.tensor(log_prob, dtype=torch.float64))
+
+
+WEIGHTED = {"loss gradient": "`balance` weights the gradient of the loss on purpose (test_student_t.py)"}
+ROWS = {
+    "student_t": (
+        HeadRow("calibrated", ONE, cases=cases, leave_out=WEIGHTED),
+        HeadRow("predicted", ONE, {"degrees_of_freedom": "predicted", "balance": 0.0}, cases=cases),
+        HeadRow("two numbers", TWO, {"degrees_of_freedom": 4.5, "balance": 0.0}, cases=cases, scale=0.5),
+        HeadRow(
+            "heavy tails", ONE, {"degrees_of_freedom": 2.5, "floor": 0.1}, cases=cases, leave_out=WEIGHTED
+        ),
+    )
+}
