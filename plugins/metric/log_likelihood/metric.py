@@ -1,5 +1,6 @@
 """Mean log-likelihood or its negative, with the standard error, from a running mean and sum of squared deviations."""
 
+import logging
 from typing import ClassVar, Literal
 
 import torch
@@ -10,6 +11,10 @@ from framework.distributions.checks import refuse_nan
 from framework.distributions.protocol import Estimate
 from framework.metric import Metric
 from framework.prediction import Prediction
+
+UNLIKELY = 20.0
+"""Number of nats below the median log-likelihood at which a target is reported."""
+_log = logging.getLogger(__name__)
 
 
 class Moments(Metric):
@@ -48,6 +53,7 @@ class LogLikelihood(Moments):
 
     def update(self, prediction: Prediction) -> None:
         self.add_samples(prediction.log_prob, prediction.estimate)
+        warn_of_unlikely(prediction)
 
     def compute(self) -> dict[str, Tensor]:
         return summary("log_likelihood", self.moments, self.sampling)
@@ -71,11 +77,38 @@ class NegativeLogLikelihood(Moments):
         self.add_samples(
             refuse_nan(prediction.log_prob, "log-likelihoods of the targets"), prediction.estimate
         )
+        warn_of_unlikely(prediction)
 
     def compute(self) -> dict[str, Tensor]:
         results = summary("nll", self.moments, self.sampling)
         # subtract from 0, so that an NLL of zero is not -0
         return results | {name: 0 - results[name] for name in ("nll", "nll_debiased") if name in results}
+
+
+def warn_of_unlikely(prediction: Prediction) -> None:
+    """Log a warning if real-valued targets are more than UNLIKELY nats less likely than the median of their batch.
+
+    A mean over all samples hides that a few of them decide it.
+    """
+    log_prob = prediction.log_prob.detach()
+    if len(log_prob) == 0 or prediction.split != "test" or prediction.target.dim() != 2:
+        return
+    below = log_prob < log_prob.median() - UNLIKELY
+    if not bool(below.any()):
+        return
+    row = int(log_prob.argmin())
+    index = prediction.batch["index"][row] if "index" in prediction.batch else row
+    _log.warning(
+        "log-likelihood: %d of %d targets are more than %g nats less likely than the median; the least likely is test "
+        "sample %d, target %s, with %.4g nats. Its predicted density is far too narrow, or the target is wrong. A "
+        "density with heavier tails (density_head=student_t) or calibration (uncertainty=[folds]) bounds such losses.",
+        int(below.sum()),
+        len(below),
+        UNLIKELY,
+        int(index),
+        ", ".join(f"{value:.4g}" for value in prediction.target[row].tolist()),
+        float(log_prob[row]),
+    )
 
 
 def summary(

@@ -247,3 +247,13 @@ def test_nll_of_estimates_has_the_opposite_bias():
     assert actual["nll_debiased"] == pytest.approx(-3 - sum(squares) / 8)
     assert actual["nll_mc_error"] == pytest.approx(sum(squares) ** 0.5 / 4)
     assert (actual["samples_max"], actual["items_above_tolerance"]) == (30, 1)
+
+
+def test_targets_far_below_the_median_are_reported(caplog):
+    metric = LogLikelihood()
+    metric.update(prediction([-1.0, -20.5, 0.0]))
+    assert not caplog.messages
+    metric.update(prediction([-1.0, -21.5, 0.0]))
+    assert len(caplog.messages) == 1
+    assert "1 of 3 targets are more than 20 nats less likely" in caplog.messages[0]
+    assert "test sample 1, target 0, with -21.5 nats" in caplog.messages[0]
