@@ -17,7 +17,7 @@ Probability = Annotated[float, Field(ge=0, lt=1)]
 class MLP(Encoder):
     """Fully connected layers on the flattened input.
 
-    Each layer is linear, batch norm if requested, ReLU or ELU (Clevert et al. 2016), dropout. With
+    Each layer is linear, batch norm if requested, an activation, dropout. With
     `batch_norm="after_relu"` the order is linear, activation, batch norm, dropout, as in the blocks of thesis §6.5.1.
 
     Args:
@@ -26,7 +26,11 @@ class MLP(Encoder):
         dropout: probability of dropping an output of a layer; one number for all layers, or one for each.
         batch_norm: whether to normalise over the batch: True before the activation, "after_relu" after it; training
             then needs batches of at least two samples.
-        activation: "relu" (rectified linear units) or "elu" (exponential linear units).
+        activation: "relu" (rectified linear units), "elu" (exponential linear units) or "silu" (x times its logistic
+            function, Elfwing et al. 2018).
+        initial: "torch": torch's initial weights and biases, uniform within 1/√n for n inputs; "he": normal weights of
+            variance 2/n and biases of 0 (He et al. 2015), and weights of 0 in the linear layer to the head. Small
+            smooth networks then learn more of a target with little noise.
 
     Raises:
         ConfigError: a sample holds no numbers, or the number of probabilities differs from the number of layers.
@@ -41,7 +45,8 @@ class MLP(Encoder):
         widths: list[Width] = [512, 512],  # noqa: B006 - never written
         dropout: Probability | list[Probability] = 0.0,
         batch_norm: bool | Literal["after_relu"] = False,
-        activation: Literal["relu", "elu"] = "relu",
+        activation: Literal["relu", "elu", "silu"] = "relu",
+        initial: Literal["torch", "he"] = "torch",
     ) -> None:
         super().__init__()
         length = require_numbers(input_shape, by="mlp")
@@ -53,7 +58,7 @@ class MLP(Encoder):
             )
         layers: list[nn.Module] = []
         before, after = batch_norm is True, batch_norm == "after_relu"
-        units = {"relu": nn.ReLU, "elu": nn.ELU}[activation]
+        units = {"relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}[activation]
         for width, drop in zip(widths, drops, strict=True):
             layers.append(
                 nn.Linear(length, width, bias=not before)
@@ -63,6 +68,13 @@ class MLP(Encoder):
             layers += [nn.BatchNorm1d(width)] * after
             layers.append(nn.Dropout(drop))
             length = width
+        if initial == "he":
+            for layer in layers:
+                if isinstance(layer, nn.Linear):
+                    nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+                    if layer.bias is not None:
+                        nn.init.zeros_(layer.bias)
+        self.starts_flat = initial == "he"
         self.layers = nn.Sequential(*layers)
         self.vectorises = not batch_norm  # the running moments of batch norm are buffers
         self.output_shape = (length,)

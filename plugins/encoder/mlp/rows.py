@@ -8,6 +8,7 @@ ROWS = {
         EncoderRow("images", (3, 4, 5), {"widths": [16, 8], "dropout": 0.2}),
         EncoderRow("no layers", (5, 2), {"widths": []}),
         EncoderRow("exponential units", (7,), {"widths": [9, 8], "activation": "elu"}),
+        EncoderRow("smooth units", (7,), {"widths": [9, 8], "activation": "silu"}),
         EncoderRow("batch norm", (6, 4), {"widths": [12, 8], "batch_norm": True}),
         EncoderRow(
             "the thesis's blocks",

@@ -22,10 +22,12 @@ def by_hand(encoder, inputs):
             numbers = np.maximum(numbers, 0)
         elif isinstance(layer, torch.nn.ELU):
             numbers = np.where(numbers > 0, numbers, np.expm1(np.minimum(numbers, 0)))
+        elif isinstance(layer, torch.nn.SiLU):
+            numbers = numbers / (1 + np.exp(-numbers))
     return numbers
 
 
-@pytest.mark.parametrize("activation, units", [("relu", "ReLU"), ("elu", "ELU")])
+@pytest.mark.parametrize("activation, units", [("relu", "ReLU"), ("elu", "ELU"), ("silu", "SiLU")])
 @pytest.mark.parametrize("batch_norm", [False, True, "after_relu"])
 @pytest.mark.parametrize("shape, widths", [((7,), [5]), ((3, 4, 2), [16, 8, 4]), ((1,), [1]), ((2, 3), [])])
 def test_agrees_with_numpy(shape, widths, batch_norm, activation, units):
@@ -93,3 +95,12 @@ def test_refuses_samples_without_numbers():
 def test_refuses_a_config_out_of_range(config):
     with pytest.raises(ConfigError, match=r"encoder\."):
         resolve("encoder", {"name": "mlp", **config})
+
+
+def test_initial_weights_of_he_have_twice_the_variance_of_the_inputs():
+    torch.manual_seed(0)
+    encoder = MLP((200,), widths=[300, 300], initial="he")
+    assert encoder.starts_flat and not MLP((3,)).starts_flat
+    for layer, inputs in ((encoder.layers[0], 200), (encoder.layers[3], 300)):
+        assert layer.weight.var().item() == pytest.approx(2 / inputs, rel=0.03)
+        assert not layer.bias.any()
