@@ -63,6 +63,22 @@ class Encoder(nn.Module, ABC):
         """Return features of shape (batch, *output_shape), of the parameters' dtype. The batch may be empty."""
 
 
+class FitsInputs(ABC):
+    """Additional base class of an encoder that is fitted once to the inputs of the training split, before training.
+
+    Its fitted numbers are buffers, so that checkpoints store them. It is `Encoder.fixed`, and no encoder that is
+    trained may precede it. It also gives features before it is fitted.
+    """
+
+    @abstractmethod
+    def fit_inputs(self, inputs: Float[Tensor, "sample *input"]) -> None:
+        """Fit the encoder in place.
+
+        Args:
+            inputs: what the encoder reads for each sample of the training split.
+        """
+
+
 def require_numbers(input_shape: tuple[int, ...], by: str) -> int:
     """Return how many numbers a sample of this shape holds.
 

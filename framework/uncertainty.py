@@ -84,6 +84,57 @@ class SeveralModels(ABC):
         """Scale the gradient of each model down to the norm `max_norm` if its norm is larger."""
 
 
+class SelfTraining(ABC):
+    """Additional base class of a wrapper that trains its models itself, on training and validation split together.
+
+    The wrapper must divide the samples itself, such that each is also predicted by models that did not see it. Settings
+    of the trainer and the optimiser have no effect, and objectives are refused.
+
+    Attributes:
+        rows: numbers of the samples of the next prediction among those that trained, (batch,); the wrapper then
+            predicts each sample by the models that did not see it. None: all models predict. The attribute is set by
+            `held_out` only.
+    """
+
+    rows: Tensor | None = None
+
+    @abstractmethod
+    def train_models(
+        self, inputs: Float[Tensor, "sample *input"], target: Tensor, *, seed: int, batch_size: int
+    ) -> float:
+        """Train and calibrate all models in place; return the mean loss of samples by models that did not see them.
+
+        Args:
+            inputs: inputs of the training split, then those of the validation split.
+            target: targets of the same samples, (sample, *event).
+            seed: seed of random numbers.
+            batch_size: number of samples of a training batch of each model.
+        """
+
+
+def self_training(predictor: Predictor) -> SelfTraining | None:
+    """Return the outermost wrapper that trains its models itself, or None if there is none."""
+    return next((module for module in predictor.modules() if isinstance(module, SelfTraining)), None)
+
+
+@contextmanager
+def held_out(predictor: Predictor, batch: Batch) -> Iterator[None]:
+    """Predict the samples of a batch by models that did not see them inside the block.
+
+    It has an effect if a wrapper trains its models itself (`SelfTraining`), and the batch says which of the samples
+    that trained it holds (the field "row", which the framework adds for calibration).
+    """
+    wrapper = self_training(predictor)
+    if wrapper is None:
+        yield
+        return
+    wrapper.rows = batch.get("row")
+    try:
+        yield
+    finally:
+        wrapper.rows = None
+
+
 def remarks(predictor: Predictor) -> tuple[str, ...]:
     """Return the remarks that the wrappers of a predictor set in `calibrate`, the innermost last."""
     notes = (module.remark for module in predictor.modules() if isinstance(module, Uncertainty))

@@ -13,6 +13,7 @@ from torch.distributions import Distribution
 from framework.data import Batch
 from framework.errors import UserError
 from framework.model import Predictor
+from framework.uncertainty import held_out
 
 
 def nonempty_batches(batches: Iterable[Batch], by: str) -> list[Batch]:
@@ -36,10 +37,19 @@ def nonempty_batches(batches: Iterable[Batch], by: str) -> list[Batch]:
 
 @torch.no_grad()
 def predict_densities(model: Predictor, batches: Sequence[Batch]) -> list[Distribution]:
-    """Return the density of each batch, computed in evaluation mode and without gradient."""
+    """Return the density of each batch, computed in evaluation mode and without gradient.
+
+    Samples on which a wrapper has trained its models itself (`SelfTraining`) are predicted by models that did not see
+    them.
+    """
     training = model.training
+    densities = []
     try:
-        return [model.eval()(batch["input"]) for batch in batches]
+        model.eval()
+        for batch in batches:
+            with held_out(model, batch):
+                densities.append(model(batch["input"]))
+        return densities
     finally:
         model.train(training)
 

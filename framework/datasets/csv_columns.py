@@ -13,7 +13,7 @@ import math
 import re
 import shlex
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -383,7 +383,11 @@ def require(columns: Columns, names: Sequence[str], setting: str) -> None:
 
 
 def tables(
-    files: Sequence[Path], names: Sequence[str], setting: str, writing: Writing | None = None
+    files: Sequence[Path],
+    names: Sequence[str],
+    setting: str,
+    writing: Writing | None = None,
+    arrange: Callable[[Columns], Columns] = lambda columns: columns,
 ) -> Iterator[tuple[Columns, Float[np.ndarray, "rows names"]]]:
     """Read a user's files one by one; yield each table, and the named columns as an array of numbers.
 
@@ -392,6 +396,7 @@ def tables(
         names: names of the columns, in order.
         setting: the setting that names the columns.
         writing: notation of the tables. If it is given, TRUE and FALSE are read as 1 and 0, as in a training table.
+        arrange: function that changes each table after it is read.
 
     Raises:
         DataError: there is no file; or as in `read_columns`, `require` and `numbers`.
@@ -402,7 +407,7 @@ def tables(
             "such a file."
         )
     for file in files:
-        columns = read_columns(Path(file), writing)
+        columns = arrange(read_columns(Path(file), writing))
         require(columns, names, setting)
         values = [numbers(columns, name, missing="", booleans=writing is not None) for name in names]
         yield columns, np.stack(values, -1)

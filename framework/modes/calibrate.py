@@ -18,7 +18,7 @@ from framework.reports.report import report_test
 from framework.runs.run import open_run
 from framework.runs.session import add_test_parts, calibrate, for_trained
 from framework.target import Target
-from framework.uncertainty import SeveralModels
+from framework.uncertainty import SelfTraining, SeveralModels, self_training
 
 FEW = 2
 """Number of samples with which uncertainty wrappers are tried before they are fitted."""
@@ -37,6 +37,11 @@ def run(config: Config) -> None:
     config.options(CalibrateOptions)
     wrappers = resolve_wrappers(config.settings.uncertainty or {})
     session = for_trained(config)
+    if self_training(session.predictor) is not None and not config.first_override("data"):
+        raise ConfigError(
+            f"{config.settings.checkpoint} was trained on the validation split too, so that a wrapper fitted to it "
+            "would be overconfident. Choose the wrapper when you train, or give other data with data=..."
+        )
     existing = [part["name"] for part in session.parts["uncertainty"]]
     for part in wrappers:
         if part["name"] in existing:
@@ -71,7 +76,7 @@ def resolve_wrappers(wrappers: Mapping[str, Any]) -> list[dict[str, Any]]:
         )
     resolved = [resolve("uncertainty", part, f"uncertainty.{key}") for key, part in wrappers.items()]
     for part in resolved:
-        if issubclass(load("uncertainty", part["name"]), SeveralModels):
+        if issubclass(load("uncertainty", part["name"]), (SeveralModels, SelfTraining)):
             raise ConfigError(
                 f"uncertainty={part['name']} trains several models, but a checkpoint holds one. Train the wrapper with "
                 "mode=train, or join separately trained models with mode=combine mode.members=[...]."

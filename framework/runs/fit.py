@@ -5,16 +5,19 @@ import time
 from functools import partial
 
 import pytorch_lightning as pl
+import torch
 from rich.console import Console
 from torch import distributed as dist
 
 from framework.configuration.loading import fill, predictor_weights
 from framework.configuration.settings import TRAINER_OURS, device_of
 from framework.data import Data
+from framework.encoder import FitsInputs
+from framework.errors import ConfigError
 from framework.model import FrozenFrontEnd, fitted_models, learns
 from framework.runs.resuming import begin_again, resume_arguments
 from framework.runs.run import Run
-from framework.runs.session import Session
+from framework.runs.session import Session, trained_batches
 from framework.storage.checkpoints import read
 from framework.storage.first_rank import first_rank
 from framework.storage.processor import fast_bfloat16
@@ -33,7 +36,7 @@ from framework.training.module import (
 )
 from framework.training.progress import Progress
 from framework.training.rank_processes import end_together
-from framework.uncertainty import outermost
+from framework.uncertainty import SelfTraining, outermost, self_training
 
 
 def fit(session: Session, run: Run) -> tuple[float, int | None]:
@@ -43,14 +46,41 @@ def fit(session: Session, run: Run) -> tuple[float, int | None]:
     nothing to learn (a renderer, for example). Ranks other than the first return after training without loading these
     weights.
     """
+    if session.settings.checkpoint is None:  # weights of another training belong to its own fitted encoders
+        _fit_encoders(session)
+    wrapper = self_training(session.predictor)
+    if wrapper is not None:
+        return _train_itself(session, run, wrapper), None
     if not learns(session.predictor):
         return _fit_at_once(session, run), None
     return _fit_by_gradient(session, run)
 
 
+@torch.no_grad()
+def _fit_encoders(session: Session) -> None:
+    """Fit the encoders of class `FitsInputs` to the training split, each to the features of those before it.
+
+    Raises:
+        ConfigError: such an encoder follows an encoder that is trained.
+    """
+    front = session.predictor.encoders if isinstance(session.predictor, FrozenFrontEnd) else ()
+    for module in session.predictor.modules():
+        if isinstance(module, FitsInputs) and not any(module is encoder for encoder in front):
+            raise ConfigError(
+                f"{type(module).__name__} is fitted to the inputs before training, but an encoder that is trained "
+                "precedes it. Put it first in encoder=[...]."
+            )
+    if not any(isinstance(encoder, FitsInputs) for encoder in front):
+        return
+    batches = session.batches()
+    inputs = torch.cat([batch["input"] for batch in batches.of(session.data.splits().train)])
+    for encoder in front:
+        if isinstance(encoder, FitsInputs):
+            encoder.fit_inputs(inputs)
+        inputs = encoder(inputs)
+
+
 def _fit_at_once(session: Session, run: Run) -> float:
-    if run.resumed:
-        run.tracker.drop_after(-1)  # a killed run may have logged its loss, which has step 0
     fed = _cache_features(session) if fitted_models(session.predictor) else session.data
     inner = session.predictor
     if fed is not session.data and isinstance(inner, FrozenFrontEnd):
@@ -60,8 +90,35 @@ def _fit_at_once(session: Session, run: Run) -> float:
     fit_at_once(inner, batches, session.settings.seed)
     loss = mean_loss(inner.eval(), batches.val_dataloader())
     session.console.print(f"fitted in {time.perf_counter() - start:.1f} s; validation loss {loss:.4f} nats")
-    run.tracker.log_metrics({"validation/loss": loss}, 0, 0)
+    _log_only_loss(run, loss)
     return loss
+
+
+def _train_itself(session: Session, run: Run, wrapper: SelfTraining) -> float:
+    """Let a wrapper train its models on training and validation split, and return its loss of samples not seen."""
+    fed = _cache_features(session)
+    front = session.predictor if isinstance(session.predictor, FrozenFrontEnd) else None
+    start = time.perf_counter()
+    with torch.no_grad():
+        loaded = list(trained_batches(session.batches(fed)))
+        if front is not None and fed is session.data:
+            loaded = [{**batch, "input": front.features(batch["input"])} for batch in loaded]
+    inputs, target = (torch.cat([batch[name] for batch in loaded]) for name in ("input", "target"))
+    settings = session.settings
+    loss = wrapper.train_models(inputs, target, seed=settings.seed, batch_size=settings.batch_size)
+    session.console.print(
+        f"trained on {len(inputs)} samples of training and validation in {time.perf_counter() - start:.1f} s; loss of "
+        f"samples that a model did not see {loss:.4f} nats"
+    )
+    _log_only_loss(run, loss)
+    return loss
+
+
+def _log_only_loss(run: Run, loss: float) -> None:
+    """Log the validation loss of a model that is fitted in one step."""
+    if run.resumed:
+        run.tracker.drop_after(-1)  # a killed run may have logged its loss, which has step 0
+    run.tracker.log_metrics({"validation/loss": loss}, 0, 0)
 
 
 def _fit_by_gradient(session: Session, run: Run) -> tuple[float, int]:

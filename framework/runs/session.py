@@ -64,7 +64,7 @@ from framework.storage.progress import output
 from framework.target import Target
 from framework.tracking.run_info import MODEL
 from framework.training.batches import Batches, require_targets, track_batches
-from framework.uncertainty import remarks
+from framework.uncertainty import SelfTraining, remarks, self_training
 
 if TYPE_CHECKING:  # a metric imports torchmetrics, which predictions do not need
     from framework.metric import Metric
@@ -208,6 +208,14 @@ def for_training(config: Config) -> Session:
         predictor = start.predictor_for(data, parts, seed)
         hint = "to continue a run that was stopped, use resume=<folder of the run>"
         console.print(f"starting a new training from the weights of {start.path} ({hint})", soft_wrap=True)
+    trains_itself = next((part for part in predictor.modules() if isinstance(part, SelfTraining)), None)
+    if trains_itself is not None and not resumed:
+        _refuse_training(config, f"{type(trains_itself).__name__} trains its models itself")
+    if trains_itself is not None and objectives:
+        raise ConfigError(
+            f"{type(trains_itself).__name__} trains its models itself, so that an objective has no effect. Leave "
+            "objective out, or choose another uncertainty."
+        )
     if not learns(predictor) and not resumed:
         _refuse_training(config, "no part of this model learns by gradient")
     if objectives and not learns(predictor):
@@ -601,10 +609,27 @@ def calibrate(session: Session) -> None:
     """Calibrate the session's predictor on the validation split, and print its remarks."""
     session.predictor.eval().to(session.device)
     seed_step(session.settings.seed, 0, "calibrate")
-    batches = track_batches(session.blocks().val_dataloader(), "calibrating")
+    if session.config.mode == "train" and self_training(session.predictor) is not None:
+        batches = trained_batches(session.blocks())
+    else:
+        batches = track_batches(session.blocks().val_dataloader(), "calibrating")
     session.predictor.calibrate(on_device(batches, session.device))
     for remark in remarks(session.predictor):
         session.console.print(remark, soft_wrap=True, highlight=False, markup=False)
+
+
+def trained_batches(batches: Batches) -> Iterator[Batch]:
+    """Yield the batches of the training and the validation split, on which a wrapper trains its models itself.
+
+    Each batch also has the field "row", the number of each sample in this order.
+    """
+    first = 0
+    splits = batches.data.splits()
+    for split in (splits.train, splits.validation):
+        for batch in batches.of(split):
+            count = len(batch["input"])
+            yield {**require_targets(batch, batches.data.target), "row": torch.arange(first, first + count)}
+            first += count
 
 
 def keep_memory() -> None:

@@ -17,12 +17,14 @@ from framework.datasets.csv_columns import LabelledWriting
 from framework.errors import DataError, quote
 from plugins.data.tabular.picture import bars
 from plugins.data.tabular.table import (
+    Arrange,
     InputColumns,
     Kind,
     Missing,
     Question,
     Standardise,
     Table,
+    WordColumns,
     from_memory,
     load,
     read,
@@ -51,6 +53,8 @@ class Tabular(Data):
         missing: Treatment of rows without a number or a label. "error" refuses them, "skip" leaves them out.
         small_angles: Whether angles in degrees may all lie within ±2π; by default this is refused, because such angles
             look like radians.
+        words: Treatment of columns of words. "leave_out" does not read them; "levels" reads a column of 0 and 1 for
+            each of up to 50 different words. Words that the training table does not have are read as none of them.
         writing: Notation of the file, and of further files for prediction: separator, decimal sign and the like.
     """
 
@@ -72,6 +76,7 @@ class Tabular(Data):
         data_seed: Annotated[int, Field(ge=0, lt=2**31)] = 0,
         missing: Missing = "error",
         small_angles: bool = False,
+        words: WordColumns = "leave_out",
         writing: LabelledWriting,
     ) -> None:
         names = (target,) if isinstance(target, str) else tuple(dict.fromkeys(target))
@@ -79,6 +84,7 @@ class Tabular(Data):
         self.path = path
         self._trained: InputColumns | None = None
         self.small_angles = small_angles
+        self.words = words
         self.writing = writing
         self.question = Question(names, kind, chosen, validation, test, data_seed, missing)
 
@@ -115,7 +121,18 @@ class Tabular(Data):
                 "1 to leave rows for training. Reduce one of them."
             )
         file = Path(self.path).expanduser()
-        return load(file, question, self._trained, self.writing, small_angles=self.small_angles)
+        return load(
+            file,
+            question,
+            self._trained,
+            self.writing,
+            small_angles=self.small_angles,
+            words=self.words,
+            arrange=self._arrange,
+        )
+
+    _arrange: Arrange | None = None
+    """Function that changes cells and settings after the table is read; a subclass may set it."""
 
     def check_files(self) -> None:
         _ = self._table

@@ -38,10 +38,32 @@ def row(name: str, target: object, kind: str) -> DataRow:
     )
 
 
+def write_set(folder: Path) -> Mapping[str, str]:
+    """Write a set with two inputs, a target and two splits; return the settings that name it."""
+    lines = ["number,square,height,test_in_splits"]
+    for row in range(40):
+        lines.append(
+            f"{row},{row * row},{row / 2 - 3},{'T.' if row % 4 == 0 else '.T' if row % 4 == 1 else '..'}"
+        )
+    (folder / "concrete.csv").write_text("\n".join(lines), encoding="utf-8")
+    return {"root": str(folder)}
+
+
 ROWS = {
+    "uci": (
+        DataRow(
+            "a small set",
+            {"validation": 0.2},
+            write=write_set,
+            synthetic=False,
+            files=files,
+            fragile={"concrete.csv": DAMAGES},
+            changes={"split": 1, "data_seed": 1, "validation": 0.3},
+        ),
+    ),
     "tabular": (
         row("a label", "class", "class"),
         row("two numbers", ["real", "angle"], "real"),
         row("an angle", "angle", "degrees"),
-    )
+    ),
 }

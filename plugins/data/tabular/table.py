@@ -1,7 +1,8 @@
 """Conversion of a user's CSV table to tensors: choice of columns, rows and splits."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -32,9 +33,11 @@ from framework.errors import DataError, did_you_mean, quote, shorten
 from framework.storage import text
 from framework.storage.arrays import to_real
 from framework.target import Target
+from plugins.data.tabular.levels import add_levels, expand_words, levels_in_memory
 
 Kind = Literal["class", "real", "degrees", "radians"]
 Missing = Literal["error", "skip"]
+WordColumns = Literal["leave_out", "levels"]
 SPLITS = Splits._fields
 SPLIT, GROUP = "split", "group"
 MANY_LABELS = 20
@@ -51,6 +54,10 @@ class Question(NamedTuple):
     test: float
     data_seed: int
     missing: Missing
+
+
+Arrange = Callable[[Columns, Question], tuple[Columns, Question]]
+"""Function that changes the cells of a table after they are read, and the settings of the data set."""
 
 
 class Scaling(NamedTuple):
@@ -134,6 +141,8 @@ def load(
     writing: Writing | None = None,
     *,
     small_angles: bool = False,
+    words: WordColumns = "leave_out",
+    arrange: Arrange | None = None,
 ) -> Table:
     """Read, check, split and standardise a table.
 
@@ -143,12 +152,22 @@ def load(
         trained: Input columns of a trained model; None to fit the scaling to the training rows of this table.
         writing: Notation of the file; None for the default.
         small_angles: Whether angles in degrees may all lie within ±2π.
+        words: Treatment of columns of words.
+        arrange: Function that changes cells and settings after the table is read, such as the column `split`.
 
     Raises:
         DataError: The file, a column, a cell, a label or a split has a fault; the message names line and column.
     """
     cells = read_columns(file, writing or LabelledWriting())
+    cells, question = (cells, question) if arrange is None else arrange(cells, question)
     digest = hashlib.sha256(repr((cells.cells, question)).encode()).hexdigest()
+    if trained is not None:
+        cells = add_levels(cells, trained.names)
+    elif words == "levels":
+        cells, levels = expand_words(cells, (*question.target, SPLIT, GROUP))
+        if question.columns is not None:
+            names = [part for name in question.columns for part in levels.get(name, (name,))]
+            question = question._replace(columns=tuple(names))
     choice = _choose_inputs(cells, question) if trained is None else _choose(cells, question, trained.names)
     columns = choice.names
     require(cells, columns, "The trained model")
@@ -200,7 +219,9 @@ def read(files: Sequence[Path], columns: InputColumns, writing: Writing | None =
         DataError: There is no file, or a file cannot be read, lacks a column, or has a cell that is no finite number.
     """
     parts = []
-    for cells, inputs in tables(files, columns.names, "The trained model", writing or LabelledWriting()):
+    notation, setting = writing or LabelledWriting(), "The trained model"
+    arrange = partial(add_levels, names=columns.names)
+    for cells, inputs in tables(files, columns.names, setting, notation, arrange):
         rows = np.arange(len(inputs))
         parts.append(as_float32(cells, columns.names, rows, standardise(inputs, columns.scaling)))
     inputs = torch.cat(parts)
@@ -214,13 +235,15 @@ def from_memory(user_data: Any, columns: InputColumns) -> Float[Tensor, "row col
         DataError: A column is missing, a cell is not a finite number, or an array has another number of columns.
     """
     if hasattr(user_data, "columns") or isinstance(user_data, Mapping):
-        missing = [name for name in columns.names if name not in user_data]
+        levels = levels_in_memory(user_data, columns.names)
+        missing = [name for name in columns.names if name not in user_data and name not in levels]
         if missing:
             raise DataError(
                 f"The model reads the column {missing[0]!r}, which the data do not "
                 f"have.{did_you_mean(missing[0], user_data)} It reads the columns {', '.join(columns.names)}."
             )
-        user_data = np.stack([np.atleast_1d(np.asarray(user_data[name])) for name in columns.names], -1)
+        parts = [levels[name] if name in levels else user_data[name] for name in columns.names]
+        user_data = np.stack([np.atleast_1d(np.asarray(part)) for part in parts], -1)
     try:
         rows = to_real(user_data, "the input")
     except (TypeError, ValueError) as error:

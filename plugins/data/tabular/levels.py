@@ -1,0 +1,101 @@
+"""Columns of words as numbers: one column of 0 and 1 for each level, the different words of a column."""
+
+import logging
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from framework.datasets.csv_columns import Columns, numeric_columns
+from framework.errors import quote
+
+MOST_LEVELS = 50
+"""Largest number of levels of a column; a column with more is left out, since it holds names or free text."""
+_log = logging.getLogger(__name__)
+
+
+def name_of(column: str, level: str) -> str:
+    """Return the name of the column of 0 and 1 that says whether `column` has this level."""
+    return f"{column}={level}"
+
+
+def expand_words(cells: Columns, but: Collection[str]) -> tuple[Columns, Mapping[str, tuple[str, ...]]]:
+    """Return the table with a column for each level of each column of words, and the names of these by column.
+
+    Args:
+        cells: The table.
+        but: Columns that are used for something else and stay as they are.
+    """
+    reasons = numeric_columns(cells, but, "data.columns").left_out
+    columns: dict[str, list[str]] = {}
+    expanded: dict[str, tuple[str, ...]] = {}
+    for name, words in cells.cells.items():
+        levels = sorted(_levels(cells, name)) if reasons.get(name, "").startswith("words") else []
+        names = tuple(name_of(name, level) for level in levels)
+        if not 2 <= len(levels) <= MOST_LEVELS or any(part in cells.cells for part in names):
+            columns[name] = words
+            continue
+        expanded[name] = names
+        for part, level in zip(names, levels, strict=True):
+            columns[part] = _indicator(words, level)
+    return replace(cells, cells=columns), expanded
+
+
+def add_levels(cells: Columns, names: Sequence[str]) -> Columns:
+    """Return a table with the columns of levels among `names` that it lacks, and log levels that are not among them."""
+    columns = dict(cells.cells)
+    for column, levels in known_levels(names, cells.cells).items():
+        for level in levels:
+            columns[name_of(column, level)] = _indicator(cells.cells[column], level)
+        unknown = _levels(cells, column)
+        report_unknown({word: count for word, count in unknown.items() if word not in levels}, column)
+    return replace(cells, cells=columns)
+
+
+def known_levels(names: Sequence[str], present: Collection[Any]) -> dict[str, list[str]]:
+    """Return the levels that a model reads, by the name of a column in `present`.
+
+    Args:
+        names: Columns that the model reads.
+        present: Columns of a table.
+    """
+    levels: dict[str, list[str]] = {}
+    for name in names:
+        column, mark, level = name.partition("=")
+        if name not in present and mark and column in present:
+            levels.setdefault(column, []).append(level)
+    return levels
+
+
+def levels_in_memory(user_data: Any, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return the columns of levels among `names`, for rows in memory that have the columns of words themselves."""
+    columns: dict[str, np.ndarray] = {}
+    for column, levels in known_levels(names, [*user_data]).items():
+        words = np.array([str(word).strip() for word in np.atleast_1d(np.asarray(user_data[column], object))])
+        for level in levels:
+            columns[name_of(column, level)] = (words == level).astype(np.float64)
+        report_unknown(Counter(word for word in words.tolist() if word not in levels), column)
+    return columns
+
+
+def report_unknown(unknown: Mapping[str, int], column: str) -> None:
+    """Log a warning about levels that the model does not know; there is none if `unknown` is empty."""
+    if unknown:
+        _log.warning(
+            "tabular: %d rows have levels in the column %s that the training table does not have, such as %s; they "
+            "are read as none of the known levels.",
+            sum(unknown.values()),
+            quote(column),
+            quote(next(iter(unknown))),
+        )
+
+
+def _levels(cells: Columns, name: str) -> Counter[str]:
+    """Return the words of a column that are not missing, with their numbers of rows."""
+    return Counter(word for word in cells.cells[name] if word.lower() not in cells.notation.missing)
+
+
+def _indicator(words: Sequence[str], level: str) -> list[str]:
+    return ["1" if word == level else "0" for word in words]

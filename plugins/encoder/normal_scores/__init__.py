@@ -1,0 +1,1 @@
+"""Normal scores of numbers beside the numbers themselves."""

@@ -1,0 +1,20 @@
+"""Contract-test cases: small cross-fitted ensembles for each kind of target.
+
+No case has an identity, a setting with which the wrapper equals the model: each sample needs a model that did not see
+it, so that there are at least two models.
+"""
+
+from framework.target import Target
+from framework.testing.rows import WrapperRow
+
+ROWS = {
+    "folds": (
+        WrapperRow("reals", Target("real", ("x", "y")), {"folds": 2}),
+        WrapperRow("classes", Target("class", ("a", "b", "c")), {"folds": 3}),
+        WrapperRow(
+            "one angle, one group",
+            Target("angle", ("azimuth",)),
+            {"folds": 2, "dropout": [0.2], "weight_decay": [0.0]},
+        ),
+    )
+}

@@ -1,0 +1,200 @@
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from framework.calibration.validation import predict_densities
+from framework.configuration.schema import build, resolve
+from framework.errors import ConfigError
+from framework.model import Model
+from framework.target import Target
+from framework.testing.plain import Plain
+from framework.uncertainty import held_out
+from plugins.uncertainty.folds.chain import build_chain
+from plugins.uncertainty.folds.groups import Apart, Together
+from plugins.uncertainty.folds.training import Training, assign_folds
+from plugins.uncertainty.folds.wrapper import PSEUDO, fit_log_weights
+
+TARGET = Target("real", ("y",), location=(3.0,), scale=(2.0,))
+SHORT = {"folds": 3, "steps": 40, "epochs": 1}
+
+
+def model(target=TARGET, head="student_t", width=16):
+    encoder = build(
+        "encoder",
+        resolve("encoder", {"name": "mlp", "widths": [width], "activation": "silu"}),
+        input_shape=(2,),
+    )
+    return Model([encoder], build("density_head", resolve("density_head", {"name": head}), target=target))
+
+
+def folds(build_model=model, **config):
+    torch.manual_seed(0)
+    return build(
+        "uncertainty",
+        resolve("uncertainty", {"name": "folds", **SHORT, **config}),
+        model=build_model,
+        target=TARGET,
+    )
+
+
+def table(count=120):
+    generator = torch.Generator().manual_seed(1)
+    inputs = torch.randn(count, 2, generator=generator)
+    noise = 0.2 * torch.randn(count, generator=generator)
+    return inputs, (3 + 2 * inputs[:, 0].sin() + noise).double().unsqueeze(1)
+
+
+def test_each_sample_is_predicted_by_models_that_did_not_see_it():
+    wrapper, (inputs, target) = folds(), table()
+    loss = wrapper.train_models(inputs, target, seed=0, batch_size=16)
+    rows = torch.arange(len(inputs))
+    batch = {"input": inputs, "target": target, "row": rows}
+    (density,) = predict_densities(wrapper, [batch])
+    assert density.log_prob(target).mean().item() == pytest.approx(-loss, rel=1e-6)
+    groups = wrapper.models.densities(inputs)
+    expected = torch.stack([part.log_prob(target.unsqueeze(1))[rows, wrapper._fold] for part in groups], 1)
+    torch.testing.assert_close(density.log_prob(target), torch.logsumexp(expected + wrapper.log_weights, 1))
+    whole = torch.stack([part.log_prob(target.unsqueeze(1)).logsumexp(1) - math.log(3) for part in groups], 1)
+    torch.testing.assert_close(
+        wrapper(inputs).log_prob(target), torch.logsumexp(whole + wrapper.log_weights, 1)
+    )
+
+
+def test_gradients_of_a_sample_reach_no_model_that_predicts_it_held_out():
+    wrapper, (inputs, target) = folds(), table()
+    fold = assign_folds(inputs, 3)
+    training = Training(wrapper.models, inputs, target, fold, 3, wrapper.schedule)
+    for step in range(training.batches):
+        for member, rows in enumerate(training._batch(step)):
+            assert (fold[rows] != member % 3).all()
+
+
+def test_the_same_seed_gives_the_same_bits_and_leaves_the_generator_alone():
+    inputs, target = table()
+    states = []
+    for _ in range(2):
+        wrapper = folds()
+        before = torch.get_rng_state()
+        wrapper.train_models(inputs, target, seed=5, batch_size=16)
+        assert torch.equal(torch.get_rng_state(), before)
+        states.append(wrapper.state_dict())
+    assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
+
+
+@pytest.mark.parametrize("dropout", [[None, 0.0], [0.3]])
+def test_chains_train_as_separate_models_do(dropout):
+    """Compare the gradients of stacked layers with those of the models themselves, without dropout."""
+    models = [model() for _ in range(2 * len(dropout))]
+    networks = [nn.Sequential(part.encoders, part.projection) for part in models]
+    chain = build_chain(networks, dropout)
+    assert chain is not None
+    together, separate = Together(chain.eval(), models[0].head, len(dropout)), Apart(models, dropout).eval()
+    inputs, target = table(len(models) * 5)
+    parts = inputs.unflatten(0, (len(models), 5)), target.unflatten(0, (len(models), 5))
+    losses = [group.losses(*parts) for group in (together, separate)]
+    torch.testing.assert_close(*losses)
+    for loss in losses:
+        loss.sum().backward()
+    for number, network in enumerate(networks):
+        linear = [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
+        for weight, bias, layer in zip(chain.weights, chain.biases, linear, strict=True):
+            torch.testing.assert_close(weight.grad[number].T, layer.weight.grad)
+            torch.testing.assert_close(bias.grad[number, 0], layer.bias.grad)
+
+
+def test_dropout_has_the_probability_of_each_group():
+    networks = [nn.Sequential(nn.Linear(1, 4000), nn.Dropout(0.5), nn.Identity()) for _ in range(4)]
+    chain = build_chain(networks, [None, 0.1])
+    for layer in (chain.weights, chain.biases):
+        layer[0].data.fill_(1.0)
+    out = chain.train()(torch.zeros(2, 1))
+    shares = (out == 0).float().mean((1, 2))
+    assert shares.tolist() == pytest.approx([0.5, 0.5, 0.1, 0.1], abs=0.03)
+    assert out.mean().item() == pytest.approx(1, abs=0.02)
+    assert (chain.eval()(torch.zeros(2, 1)) == 1).all()
+
+
+def test_networks_that_compute_something_else_are_not_stacked():
+    class Doubling(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.layers = nn.Sequential(nn.Linear(2, 2))
+
+        def forward(self, inputs):
+            return 2 * self.layers(inputs)
+
+    assert build_chain([Doubling(), Doubling()], [None]) is None
+    assert build_chain([nn.Sequential(nn.Conv1d(1, 1, 1))] * 2, [None]) is None
+    assert isinstance(folds(lambda: Plain(TARGET)).models, Apart)
+
+
+@pytest.mark.parametrize("head", ["student_t", "gaussian"])
+def test_other_models_train_too(head):
+    inputs, target = torch.randn(60, 6), torch.randn(60, 1)
+    wrapper = folds(lambda: Plain(TARGET)) if head == "gaussian" else folds(lambda: model(head=head))
+    inputs = inputs if head == "gaussian" else inputs[:, :2]
+    before = [parameter.clone() for parameter in wrapper.parameters()]
+    assert math.isfinite(wrapper.train_models(inputs, target, seed=0, batch_size=16))
+    assert all(not torch.equal(*pair) for pair in zip(before, wrapper.parameters(), strict=True))
+    assert wrapper(inputs).log_prob(target).isfinite().all()
+
+
+def test_training_improves_the_likelihood_and_calibrates_the_head():
+    inputs, target = table(300)
+    wrapper = folds(steps=400)
+    before = wrapper(inputs).log_prob(target).mean()
+    wrapper.train_models(inputs, target, seed=0, batch_size=32)
+    new_inputs, new_target = table(600)
+    after = wrapper(new_inputs[300:]).log_prob(new_target[300:]).mean()
+    assert after > before + 1
+    assert any(head.factor.item() != 1 for head in wrapper.models.heads)
+    assert "log-likelihood" in wrapper.remark and "weights of the groups" in wrapper.remark
+
+
+def test_equal_inputs_are_in_the_same_fold():
+    torch.manual_seed(0)
+    inputs = torch.randn(50, 3).repeat(4, 1)
+    fold = assign_folds(inputs, 5).view(4, 50)
+    assert (fold == fold[0]).all() and torch.bincount(fold[0]).tolist() == [10] * 5
+    few = assign_folds(torch.zeros(40, 2), 5)
+    assert torch.bincount(few).tolist() == [8] * 5
+
+
+def test_weights_of_groups_have_the_highest_likelihood():
+    log_prob = torch.tensor([[-1.0, -3.0]] * 30 + [[-3.0, -1.0]] * 10, dtype=torch.float64)
+    weights = fit_log_weights(log_prob).exp()
+    assert weights.sum().item() == pytest.approx(1)
+    first = weights[0].item()
+    totals = []
+    for weight in (first - 0.03, first, first + 0.03):
+        both = torch.tensor([weight, 1 - weight], dtype=torch.float64).log()
+        totals.append((torch.logsumexp(log_prob + both, 1).sum() + PSEUDO * both.sum()).item())
+    assert totals[1] > max(totals[0], totals[2])
+    assert fit_log_weights(torch.tensor([[0.0, -math.inf]] * 50).double()).exp()[1] > 0
+
+
+def test_samples_that_are_nearly_impossible_are_reported():
+    inputs, target = table()
+    target[11] += 1e9
+    wrapper = folds(lambda: model(head="gaussian"))
+    wrapper.train_models(inputs, target, seed=0, batch_size=16)
+    assert (
+        "1 of these samples are more than 20 nats less likely" in wrapper.remark
+        and "sample 11" in wrapper.remark
+    )
+
+
+def test_wrong_settings_are_refused():
+    with pytest.raises(ConfigError, match="have one for each group"):
+        folds(dropout=[0.1])
+    with pytest.raises(ConfigError, match="needs at least 6 samples"):
+        folds().train_models(*table(5), seed=0, batch_size=16)
+
+
+def test_held_out_is_reset_after_an_error():
+    wrapper = folds()
+    with pytest.raises(RuntimeError), held_out(wrapper, {"row": torch.zeros(1)}):
+        raise RuntimeError
+    assert wrapper.rows is None
