@@ -182,6 +182,8 @@ NOT_IN_THE_THESIS = {
     "density_head/bernoulli_image",
     "density_head/fit_pose",
     "density_head/laplace_image",
+    "density_head/student_t",
+    "encoder/normal_scores",
     "metric/coverage",
     "metric/crps",
     "metric/decision_cost",
@@ -192,6 +194,7 @@ NOT_IN_THE_THESIS = {
     "metric/prediction_set",
     "metric/risk_coverage",
     "uncertainty/conformal",
+    "uncertainty/folds",
 }
 """Plugin folders whose methods and data the thesis does not have; their pages do not compare with it."""
 

@@ -266,11 +266,11 @@ def marginal_cdfs(density: Distribution, value: Tensor) -> Tensor | None:
 
 
 @singledispatch
-def crps(density: Distribution, value: Tensor) -> Tensor | None:
+def ranked_score(density: Distribution, value: Tensor) -> Tensor | None:
     """Return the continuous ranked probability score of a density of one real number at `value` y (*batch, 1).
 
     The score E|X - y| - ½ E|X - X'| (Gneiting & Raftery 2007, eq. 21) is float64, (*batch), in the unit of the number.
-    Default: None, no formula is known. The metric `crps` then knows the scores of normals, and uses draws otherwise.
+    Default: None, no formula is known. The metric then knows the scores of normals, and uses draws otherwise.
     """
     return None
 

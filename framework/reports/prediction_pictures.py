@@ -153,8 +153,8 @@ def deviation(truth: Tensor, point: Tensor, symmetry: Tensor) -> Tensor:
     An object with n-fold `symmetry` has n true angles, 2π/n apart. A `symmetry` of 0 means that every angle is true;
     the distance is then 0.
     """
-    folds = symmetry.clamp(min=1)
-    return torch.where(symmetry == 0, 0.0, angular_distance(folds * truth, folds * point) / folds)
+    turns = symmetry.clamp(min=1)
+    return torch.where(symmetry == 0, 0.0, angular_distance(turns * truth, turns * point) / turns)
 
 
 def _caption(error: float, entropy: float, symmetry: int) -> str:

@@ -1,6 +1,7 @@
 """Regression sets of the UCI repository with the splits on which the literature compares itself."""
 
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +12,7 @@ from framework.configuration.paths import FilePath
 from framework.datasets.csv_columns import Columns, LabelledWriting
 from framework.errors import DataError, quote
 from plugins.data.tabular.data import Share, Tabular
-from plugins.data.tabular.table import Question
+from plugins.data.tabular.table import Question, Table
 
 MARKS = "test_in_splits"
 """Name of the column whose cell has one character for each split: "T" if the row is a test row of that split."""
@@ -49,14 +50,12 @@ class UCI(Tabular):
         self.split = split
         self._arrange = self._assign_splits
 
-    def prepare(self) -> None:
+    @cached_property
+    def _table(self) -> Table:
         if self.root is None:
             raise DataError(f"data.root is not set. Set data.root to the folder that holds {self.set}.csv.")
         self.path = str(Path(self.root).expanduser() / f"{self.set}.csv")
-        super().prepare()
-
-    def check_files(self) -> None:
-        self.prepare()
+        return super()._table
 
     def _assign_splits(self, cells: Columns, question: Question) -> tuple[Columns, Question]:
         """Return the cells with a column `split` instead of the marks, and the column before them as the target."""

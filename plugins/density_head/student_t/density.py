@@ -166,7 +166,7 @@ def _(density: StudentT, value: Tensor) -> Tensor:
     return density.cdf(value).squeeze(-1)
 
 
-@protocol.crps.register
+@protocol.ranked_score.register
 def _(density: StudentT, value: Tensor) -> Tensor:
     """Return the score of Student's t by its formula (Jordan, Krüger & Lerch 2019, appendix A.2)."""
     freedom, scale = density.freedom.double(), density.scale.double()

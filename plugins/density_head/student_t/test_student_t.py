@@ -10,7 +10,7 @@ from framework.configuration.schema import build, resolve
 from framework.distributions.batch_shapes import Stacked
 from framework.distributions.density import Mixture
 from framework.distributions.intervals import central_interval
-from framework.distributions.protocol import cdf, crps, median, tempered_density
+from framework.distributions.protocol import cdf, median, ranked_score, tempered_density
 from framework.errors import ConfigError, UserError
 from framework.target import Target
 from plugins.density_head.student_t.density import NORMAL, StudentT
@@ -56,7 +56,7 @@ def test_the_score_is_the_integral_of_the_squared_difference(freedom, away):
     expected = stats.t(freedom, 0, 2)
     below = quad(lambda x: expected.cdf(x) ** 2, -math.inf, away, limit=400)[0]
     above = quad(lambda x: expected.sf(x) ** 2, away, math.inf, limit=400)[0]
-    score = crps(density, torch.full((1, 1), away).double())
+    score = ranked_score(density, torch.full((1, 1), away).double())
     assert score.item() == pytest.approx(below + above, rel=1e-6)
 
 

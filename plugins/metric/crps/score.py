@@ -39,7 +39,7 @@ def crps(density: Distribution, value: Tensor, samples: int) -> Score:
 
     X and X' are independent samples of the density, and y is `value`. For an angle, |·| is the angular distance
     (Grimit, Gneiting, Berrocal & Johnson 2006, eq. 5). The score is exact for densities that register a formula
-    (`protocol.crps`), for mixtures of up to `MOST` normals, and for angles whose density a grid resolves
+    (`protocol.ranked_score`), for mixtures of up to `MOST` normals, and for angles whose density a grid resolves
     (`circular_moments`). Otherwise it is the unbiased estimate from `samples`
     draws, in `REPLICATES` parts whose spread gives the error.
 
@@ -56,7 +56,7 @@ def crps(density: Distribution, value: Tensor, samples: int) -> Score:
             return Score(exact, torch.zeros_like(exact))
         draws = fair_estimate(_draws(density, samples), at, circular=True)
         return Score(*(torch.where(moments.resolved, a, b) for a, b in zip((exact, 0.0), draws, strict=True)))
-    formula = protocol.crps(density, value)
+    formula = protocol.ranked_score(density, value)
     if formula is not None:
         return Score(formula, torch.zeros_like(formula))
     known = normals(density)

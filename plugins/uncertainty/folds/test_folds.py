@@ -198,3 +198,30 @@ def test_held_out_is_reset_after_an_error():
     with pytest.raises(RuntimeError), held_out(wrapper, {"row": torch.zeros(1)}):
         raise RuntimeError
     assert wrapper.rows is None
+
+
+def test_wrappers_around_it_are_calibrated_on_held_out_predictions():
+    inputs, target = table()
+    parts = [{"name": "temperature"}, {"name": "conformal", "miscoverage": 0.2}]
+    target_class = Target("class", ("a", "b"))
+    labels = (target[:, 0] > 3).long()
+    classes = build(
+        "uncertainty",
+        resolve("uncertainty", {"name": "folds", **SHORT}),
+        model=lambda: model(target_class, "categorical"),
+        target=target_class,
+    )
+    classes.train_models(inputs, labels, seed=0, batch_size=16)
+    inner = build("uncertainty", resolve("uncertainty", parts[0]), model=lambda: classes, target=target_class)
+    outer = build(
+        "uncertainty", resolve("uncertainty", parts[1]), model=lambda: inner, target=target_class
+    ).eval()
+    batch = {"input": inputs, "target": labels}
+    thresholds = []
+    for rows in ({"row": torch.arange(len(inputs))}, {}):
+        outer.calibrate([{**batch, **rows}])
+        thresholds.append(outer.threshold.item())
+    assert thresholds[0] != thresholds[1]  # the second is fitted to samples that the models have seen
+    with held_out(outer, {"row": torch.arange(len(inputs))}):
+        log_prob = outer(inputs).log_prob(labels)
+    assert not torch.equal(log_prob, outer(inputs).log_prob(labels))
