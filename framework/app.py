@@ -11,6 +11,19 @@ from framework.errors import ConfigError, UserError
 from framework.storage.closed_pipes import survive_closed_pipes
 from framework.storage.threads import wait_passively
 
+START = """\
+python -m framework experiment=pascal3d/scvae     train, test and report
+python -m framework experiment=<name> debug=fast  the same, shortened
+python -m framework -m experiment=<name> seed=0,1,2
+                                                  a sweep and its table
+python -m framework --help                        experiments, methods, data
+python -m framework mode=plugins                  methods and their papers
+python -m framework mode=new mode.plugin=density_head/my_head
+                                                  start a method of your own
+docs/commands.md lists all commands, also those for your own files.
+"""
+"""Text for a command without arguments."""
+
 
 def main() -> None:
     """Run the command line of `python -m framework`.
@@ -52,6 +65,12 @@ def _run() -> None:
             "that name hides it. Rename that file or folder, remove its parent folder from PYTHONPATH, or use "
             "`python -P -m framework`."
         )
+    if not sys.argv[1:]:
+        sys.stdout.write(f"{_version()}\n\n{START}")
+        sys.exit(2)
+    if sys.argv[1:] == ["--version"]:
+        sys.stdout.write(f"{_version()}\n")
+        return
     if sys.argv[1:] == ["mode=plugins"]:  # needs no config, so it makes no run folder
         from framework.modes.plugins import print_plugins
 
@@ -92,6 +111,12 @@ def _run() -> None:
     run()
     if failures:
         raise failures[0]
+
+
+def _version() -> str:
+    from framework import __version__
+
+    return f"robust-visual-learning {__version__} (Python {sys.version.split()[0]})"
 
 
 def _fail(message: str, code: int) -> None:

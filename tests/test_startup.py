@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,9 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import framework
+from framework.configuration.composition import groups, help_text, options
 from framework.configuration.modes import MODES
 from tests.conftest import Once, listed
 
+ROOT = Path(__file__).parent.parent
 HEAVY = {
     "torch",
     "torch._dynamo",
@@ -160,3 +164,32 @@ def test_a_terminal_without_our_letters_is_told_all_the_same(encoding: str, tmp_
     assert done.returncode == 0, done.stderr
     assert "von_mises" in said
     assert ("·" in said) == (encoding != "ascii")
+
+
+def test_a_command_without_arguments_says_how_to_start_within_80_columns(tmp_path: Path) -> None:
+    done = listed(folder=tmp_path)
+    assert done.code == 2
+    assert not HEAVY & done.modules
+    lines = [line for line in done.out.splitlines() if not line.startswith("MODULES")]
+    assert lines[0].startswith(f"robust-visual-learning {framework.__version__} ")
+    assert all(len(line) <= 80 for line in lines)
+    pages = re.findall(r"docs/[\w/]+\.md", done.out)
+    assert pages and all((ROOT / page).is_file() for page in pages)
+    assert not list(tmp_path.glob("outputs"))
+
+
+def test_the_version_is_that_of_the_framework(tmp_path: Path) -> None:
+    done = listed("--version", folder=tmp_path)
+    assert done.code == 0
+    assert done.out.startswith(f"robust-visual-learning {framework.__version__} ")
+
+
+def test_the_help_fits_80_columns_and_names_every_option(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    text = help_text()
+    assert all(len(line) <= 80 for line in text.splitlines() if "framework" not in line)
+    words = set(re.findall(r"[\w]+", text))
+    for group in groups():
+        assert {name.rpartition("/")[2] for name in options(group)} <= words

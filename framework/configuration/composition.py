@@ -2,8 +2,10 @@
 
 import re
 import shlex
+import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from shutil import get_terminal_size
 from traceback import walk_tb
 from typing import Any
 
@@ -137,8 +139,26 @@ def help_text() -> str:
     Hydra's own function is not used, because it copies Hydra's store of configs for each group, which is slow.
     """
     words = yaml.safe_load((folder() / "config.yaml").read_text(encoding="utf-8"))["hydra"]["help"]
-    lines = [f"{group}: {', '.join(options(group))}" for group in groups()]
-    return "\n".join([words["header"], *lines, "", words["footer"].rstrip()])
+    return "\n".join([words["header"], *map(_help_paragraph, groups()), "", words["footer"].rstrip()])
+
+
+def _help_paragraph(group: str) -> str:
+    """Return a group with its options, wrapped to the terminal; options of a subfolder stand on lines of their own."""
+    width = min(100, get_terminal_size().columns)
+    folders: dict[str, list[str]] = {}
+    for option in options(group):
+        top, _, name = option.rpartition("/")
+        folders.setdefault(top, []).append(name)
+    lines = []
+    for top, names in sorted(folders.items()):
+        start = f"  {top}/: " if top else "  "
+        lines += textwrap.wrap(
+            ", ".join(names), width, initial_indent=start, subsequent_indent="    ", break_on_hyphens=False
+        )
+    heading = f"{group}=[<name>,...]" if group in PLURAL else f"{group}=<name>"
+    if group == "hydra":
+        heading = "hydra/launcher=<name> and hydra/sweeper=<name>"
+    return "\n".join(["", heading, *lines])
 
 
 def groups() -> list[str]:
