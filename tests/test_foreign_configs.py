@@ -28,6 +28,7 @@ BAD = {
     "choice of logging": ("x.yaml", "defaults: [{override /hydra/job_logging: x}]"),
     "launcher of other machines": ("x.yaml", "defaults: [{override /hydra/launcher: ray}]"),
     "launcher's address": ("x.yaml", "hydra: {launcher: {address: 10.0.0.1}}"),
+    "sweeper's database": ("x.yaml", "hydra: {sweeper: {storage: 'postgresql://10.0.0.1/x'}}"),
     "choice elsewhere": ("x.yaml", "defaults: [{override /hydra/launcher: ../../x}]"),
     "choice as text": ("x.yaml", "defaults: [/a@hydra.job/b]"),
     "store": ("x.yaml", "logger: {uri: 'http://127.0.0.2'}"),

@@ -16,8 +16,16 @@ OWN = ("hydra", "logger", "mode")
 """Parts of a config that only the user may set: they determine the command, the output folder and the store."""
 HARMLESS = {"hydra": ("sweeper", "launcher", "verbose"), "logger": ("name", "experiment"), "mode": ()}
 """Keys in the parts `OWN` that an added config folder may set nevertheless."""
-LAUNCHERS, LAUNCHER_KEYS = ("basic", "pool"), ("jobs", "retries", "devices", "fork")
-"""Launchers that an added config folder may choose, and their keys that it may set; others reach other machines."""
+LAUNCHERS = ("basic", "pool")
+"""Launchers that an added config folder may choose; others reach other machines."""
+PART_KEYS = {
+    "launcher": ("jobs", "retries", "devices", "fork"),
+    "sweeper": (
+        *("params", "max_batch_size"),
+        *("trials", "seed", "metric", "direction", "sampler", "batch", "population", "pruner"),
+    ),
+}
+"""Keys of the launcher and the sweeper that an added config folder may set; others reach other machines."""
 CHOSEN = re.compile(r"hydra/(launcher|sweeper)|logger")
 MOST = 1000
 """Largest number of config files in an added config folder."""
@@ -77,9 +85,10 @@ def _require_harmless(file: Path, folder: Path, groups: Collection[str]) -> None
         value = content.get(key)
         if value is not None and not (isinstance(value, dict) and set(value) <= set(harmless)):
             raise _refusal(file, f"sets {key}: {quote(value)}")
-        launcher = value.get("launcher") if isinstance(value, dict) else None
-        if launcher is not None and not (isinstance(launcher, dict) and set(launcher) <= set(LAUNCHER_KEYS)):
-            raise _refusal(file, f"sets {key}.launcher: {quote(launcher)}")
+        for part, part_keys in PART_KEYS.items():
+            chosen = value.get(part) if isinstance(value, dict) else None
+            if chosen is not None and not (isinstance(chosen, dict) and set(chosen) <= set(part_keys)):
+                raise _refusal(file, f"sets {key}.{part}: {quote(chosen)}")
     try:
         forbid_targets(content)
     except ConfigError as error:

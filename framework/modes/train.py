@@ -11,14 +11,23 @@ from framework.storage.first_rank import first_rank
 
 
 def run(config: Config) -> float:
-    """Train and test a model; return the validation loss (nats) of the tested weights, which a sweeper minimises."""
+    """Train and test a model; return the validation loss (nats) of the tested weights, which a sweeper minimises.
+
+    A run that a search ends early (`framework.training.module.StopIfPruned`) is not tested, and has no value for the
+    sweeper.
+    """
     config.options(Options)
     session = for_training(config)
     with open_run(config) as run:
         session.console.print(f"run folder: {run.folder}")
         session.record(run)
-        loss, epoch = fit(session, run)
+        loss, epoch, pruned = fit(session, run)
         if not first_rank():
+            return loss
+        if pruned:
+            session.console.print("The search ended this training, and the model is not tested.")
+            run.tracker.set_tags({"pruned": "true"})
+            remove_resume_files(run)
             return loss
         if epoch is not None:
             report_training(run, session, kept_epoch=epoch)

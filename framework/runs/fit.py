@@ -3,6 +3,7 @@
 import sys
 import time
 from functools import partial
+from typing import NamedTuple
 
 import pytorch_lightning as pl
 import torch
@@ -15,6 +16,7 @@ from framework.data import Data
 from framework.encoder import FitsInputs
 from framework.errors import ConfigError
 from framework.model import FrozenFrontEnd, fitted_models, learns
+from framework.runs.job import PRUNED, RECORD
 from framework.runs.resuming import begin_again, resume_arguments
 from framework.runs.run import Run
 from framework.runs.session import Session, trained_batches
@@ -32,6 +34,7 @@ from framework.training.module import (
     NoProfiler,
     StopAtBatch,
     StopEarly,
+    StopIfPruned,
     Training,
 )
 from framework.training.progress import Progress
@@ -39,20 +42,30 @@ from framework.training.rank_processes import end_together
 from framework.uncertainty import SelfTraining, outermost, self_training
 
 
-def fit(session: Session, run: Run) -> tuple[float, int | None]:
-    """Fit the predictor, and return the validation loss (nats) and the epoch (from 0) of its fitted weights.
+class Fitted(NamedTuple):
+    """Result of a fit.
 
-    The epoch is None if no part of the predictor is trained by gradient: its head is fitted in one step, or it has
-    nothing to learn (a renderer, for example). Ranks other than the first return after training without loading these
-    weights.
+    Attributes:
+        loss: Validation loss of the fitted weights, nats.
+        epoch: Epoch of these weights, from 0; None if no part of the predictor is trained by gradient: its head is
+            fitted in one step, or it has nothing to learn (a renderer, for example).
+        pruned: Whether a search has ended the training.
     """
+
+    loss: float
+    epoch: int | None
+    pruned: bool = False
+
+
+def fit(session: Session, run: Run) -> Fitted:
+    """Fit the predictor. Ranks other than the first return after training without loading the fitted weights."""
     if session.settings.checkpoint is None:  # weights of another training belong to its own fitted encoders
         _fit_encoders(session)
     wrapper = self_training(session.predictor)
     if wrapper is not None:
-        return _train_itself(session, run, wrapper), None
+        return Fitted(_train_itself(session, run, wrapper), None)
     if not learns(session.predictor):
-        return _fit_at_once(session, run), None
+        return Fitted(_fit_at_once(session, run), None)
     return _fit_by_gradient(session, run)
 
 
@@ -121,7 +134,7 @@ def _log_only_loss(run: Run, loss: float) -> None:
     run.tracker.log_metrics({"validation/loss": loss}, 0, 0)
 
 
-def _fit_by_gradient(session: Session, run: Run) -> tuple[float, int]:
+def _fit_by_gradient(session: Session, run: Run) -> Fitted:
     settings = session.settings
     fed = (
         session.data if session.objectives else _cache_features(session)
@@ -156,7 +169,8 @@ def _fit_by_gradient(session: Session, run: Run) -> tuple[float, int]:
     if first_rank():
         fill(session.predictor, predictor_weights(read(keep.kept_path)), str(keep.kept_path))
     session.device = trainer.strategy.root_device
-    return keep.kept_loss, keep.kept_epoch
+    pruned = any(isinstance(callback, StopIfPruned) and callback.pruned for callback in trainer.callbacks)  # type: ignore[attr-defined]
+    return Fitted(keep.kept_loss, keep.kept_epoch, pruned)
 
 
 def _give_up(run: Run, error: BaseException) -> None:
@@ -204,6 +218,8 @@ def _trainer(run: Run, keep: KeepCheckpoints, console: Console) -> pl.Trainer:
     ]
     if patience:
         callbacks.append(StopEarly(patience))
+    if (run.folder / RECORD).is_file():  # the run is a job of a sweep, which may be a search that prunes
+        callbacks.append(StopIfPruned(run.folder / PRUNED))
     if chosen.get("enable_progress_bar", True):
         terminal = Console(stderr=True, quiet=console.quiet)
         callbacks.append(Progress(terminal if terminal.is_terminal else console))

@@ -17,6 +17,8 @@ SYNCED_WITHIN = 60.0
 """Seconds; a job that ends sooner sends nothing to the tracking store, and its sweep sends the job's journal."""
 RECORD = "job.json"
 VALUE = "value.json"
+PRUNED = "pruned.txt"
+"""File with which a search asks a job to end its training, because other trials have lower validation losses."""
 _COMMAND = "multirun.yaml"
 """File that Hydra leaves in the folder of a sweep."""
 

@@ -86,18 +86,19 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def require_module(name: str, extra: str) -> None:
-    """Refuse a launcher if the package on which it is built is not installed.
+def require_module(name: str, extra: str, choice: str) -> None:
+    """Refuse a launcher or sweeper if the package on which it is built is not installed.
 
     Args:
         name: Name of the package's module.
-        extra: Name of the launcher, and of the optional dependency that installs the package.
+        extra: Name of the optional dependency that installs the package.
+        choice: Override that chooses the launcher or sweeper.
 
     Raises:
         ConfigError: The package is missing.
     """
     if find_spec(name) is None:
         raise ConfigError(
-            f"hydra/launcher={extra} needs the package {name}, which is not installed. Install it: "
+            f"{choice} needs the package {name}, which is not installed. Install it: "
             f"pip install 'robust-visual-learning[{extra}]'"
         )

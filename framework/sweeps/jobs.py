@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from framework.errors import ConfigError, UserError
-from framework.runs.job import PARENT, RECORD, VALUE, find_job_folders, read_record
+from framework.runs.job import PARENT, PRUNED, RECORD, VALUE, find_job_folders, read_record
 from framework.storage.enclosed import read_plain, read_stream
 from framework.storage.files import try_lock, warn_unlocked, write_whole
 from framework.storage.names import as_bytes
@@ -168,6 +168,7 @@ def run(
     parent: str | None = None,
     store: str | None = None,
     eager: bool = False,
+    watch: Callable[[Job], None] | None = None,
 ) -> None:
     """Run every job that has not completed, and return when all have ended, successfully or not.
 
@@ -187,6 +188,7 @@ def run(
         store: Address of the tracking store that the command names.
         eager: Return as soon as every job has been started and no ended job is left unnoticed. The jobs must outlive
             this process.
+        watch: Function that is called for each running job in turn, about every `engine.interval` seconds.
 
     Raises:
         Stopped: A signal was received.
@@ -246,6 +248,8 @@ def run(
                     if (started := _start(job, slot, lock, environment, engine)) is not None:
                         running.append(started)
             for active in list(running):
+                if watch is not None:
+                    watch(active.job)
                 code = active.process.poll()
                 if active.job.record.get("pid") != active.process.pid:
                     active.job.update(pid=active.process.pid)
@@ -352,7 +356,8 @@ def _process_of(handle: str, folder: Path) -> Process | None:
 def _start(job: Job, slot: int, lock: int, environment: Mapping[str, str], engine: Engine) -> _Running | None:
     """Record that a job starts, and start it; return None if the engine refuses it."""
     job.attempts += 1
-    (job.folder / VALUE).unlink(missing_ok=True)
+    for left in (VALUE, PRUNED):
+        (job.folder / left).unlink(missing_ok=True)
     job.update(
         **job.identity,
         status="running",

@@ -263,7 +263,7 @@ def require_programs() -> None:
     Raises:
         ConfigError: One of them is missing.
     """
-    require_module("submitit", "slurm")
+    require_module("submitit", "slurm", "hydra/launcher=slurm")
     if missing := [name for name in ("sbatch", "squeue", "scancel", "srun") if shutil.which(name) is None]:
         raise ConfigError(
             f"hydra/launcher=slurm needs the commands of SLURM, but {', '.join(missing)} is not on PATH. Run the "

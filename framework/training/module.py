@@ -424,6 +424,27 @@ class StopEarly(BatchCallback, EarlyStopping):
         trainer.should_stop = trainer.should_stop or self.stopped
 
 
+class StopIfPruned(BatchCallback):
+    """Callback that stops a training at the end of a validation if a file exists.
+
+    Args:
+        path: File with which a search asks the run to stop.
+
+    Attributes:
+        pruned: Whether the training was stopped.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.pruned = False
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Stop the training in all ranks if any of them finds the file."""
+        if not trainer.sanity_checking and trainer.state.fn == "fit":
+            self.pruned = trainer.strategy.reduce_boolean_decision(self.path.is_file(), all=False)
+            trainer.should_stop = trainer.should_stop or self.pruned
+
+
 class LogMetrics(BatchCallback):
     """Callback that logs training loss and learning rate every `every_steps` steps, and the loss of every validation.
 

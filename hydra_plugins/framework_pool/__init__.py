@@ -6,8 +6,8 @@ Hydra imports this module at every start; therefore it imports nothing heavy.
 import logging
 import sys
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -60,8 +60,11 @@ class EngineLauncher(Launcher):
         self.retries = retries
         self.devices = [str(device) for device in devices or ()]
         self.eager = eager
-        self.launched: list[list[str]] = []
+        self.launched: list[sweep.Job] = []
         self.parent: str | None = None
+        self._watch: Callable[[sweep.Job], None] | None = None
+        self._search: ExitStack | None = None  # what ends with the `batches` block
+        self._search_engine: Engine | None = None
 
     def _check(self) -> None:
         """Raise a ConfigError if the engine is not installed or a setting is wrong; called before any job starts."""
@@ -79,7 +82,7 @@ class EngineLauncher(Launcher):
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
         """Run the jobs and return their results; some sweepers call this method once for each batch of jobs."""
         # imported late: Hydra imports this module at every start
-        from framework.sweeps import comparison, rehearsal
+        from framework.sweeps import comparison
 
         setup_globals()
         hydra = self.config.hydra
@@ -92,15 +95,12 @@ class EngineLauncher(Launcher):
                 f"{' '.join(swept) or 'The sweep'} has no value, so there is no job. Give a range that contains a "
                 "number, or a glob that matches a name."
             )
-        self._check()
-        configs = [self.loader.load_sweep_config(self.config, list(overrides)) for overrides in job_overrides]
-        # Number the jobs for the rehearsal. It runs before the lock is acquired, because it takes long and others wait.
-        for index, config in enumerate(configs, initial_job_idx):
-            _job_folder(folder, config, index)
+        if self._search is None:
+            configs, values = self.check(job_overrides, initial_job_idx)
+        else:
+            configs, values = self._compose(job_overrides, initial_job_idx)
+        folder.mkdir(parents=True, exist_ok=True)
         try:
-            values = [_plain_values(config, folder) for config in configs]
-            rehearsal.refuse_mistakes(list(zip(job_overrides, values, strict=True)))
-            folder.mkdir(parents=True, exist_ok=True)
             with hold_lock(folder / _LOCK):  # another sweep may begin in this folder
                 jobs = self._jobs(folder, configs, job_overrides, initial_job_idx)
                 sweep.reserve(jobs)
@@ -109,28 +109,96 @@ class EngineLauncher(Launcher):
             raise
         if not self.launched:
             self.parent = comparison.begin(folder, values[0])
-        self.launched += [job.overrides for job in jobs]
-        try:
-            with closing(self._engine(jobs, values)) as engine:
-                sweep.run(
-                    jobs,
-                    engine,
-                    at_once=self.at_once or len(jobs),
-                    retries=self.retries,
-                    devices=self.devices,
-                    parent=self.parent,
-                    store=comparison.store_of(values[0]),
-                    eager=self.eager,
-                )
-        finally:
-            comparison.summarise(folder, self.launched, values[0])
+            if self._search is not None:
+                self._search.callback(self._summarise, folder, values[0])
+        self.launched += jobs
+        with ExitStack() as stack:
+            if self._search is None:
+                stack.callback(self._summarise, folder, values[0])
+            sweep.run(
+                jobs,
+                self._engine_of(jobs, values, stack),
+                at_once=self.at_once or len(jobs),
+                retries=self.retries,
+                devices=self.devices,
+                parent=self.parent,
+                store=comparison.store_of(values[0]),
+                eager=self.eager,
+                watch=self._watch,
+            )
         if unfinished := sum(job.is_elsewhere for job in jobs):
             log.info(
                 f"{unfinished} of {len(jobs)} jobs go on without this command. To wait for them and to see the table, "
                 f"repeat the command with hydra.sweep.dir={folder}"
             )
-        failure = sweep.failure(jobs)
+        failure = self.failure()
         return [_job_return(job, failure) for job in jobs]
+
+    @contextmanager
+    def batches(self, watch: Callable[[sweep.Job], None] | None = None) -> Iterator[None]:
+        """Let a search call `launch` several times inside the block.
+
+        All batches share an engine, and the table of all jobs is printed at the end of the block. The mistakes in the
+        configs of a batch are not looked for, because the search has called `check` for its whole space.
+
+        Args:
+            watch: Function that is called again and again for each running job.
+        """
+        self._watch = watch
+        try:
+            with ExitStack() as self._search:
+                yield
+        finally:
+            self._watch = self._search = self._search_engine = None
+
+    def check(
+        self, job_overrides: Sequence[Sequence[str]], first: int = 0
+    ) -> tuple[list[DictConfig], list[dict[str, Any]]]:
+        """Return the config of each job, composed and as plain values.
+
+        Raises:
+            ConfigError: The engine is not installed, a setting of the launcher is wrong, or the config of a job has a
+                mistake (`framework.sweeps.rehearsal`).
+        """
+        from framework.sweeps import rehearsal
+
+        self._check()
+        # The check runs before the lock of the folder is acquired, because it takes long and others wait.
+        try:
+            configs, values = self._compose(job_overrides, first)
+            rehearsal.refuse_mistakes(list(zip(job_overrides, values, strict=True)))
+        except ConfigError:
+            _remove_empty_sweep(Path(str(self.config.hydra.sweep.dir)).absolute())
+            raise
+        return configs, values
+
+    def failure(self) -> Exception | None:
+        """Return an error that lists the jobs of this command that did not complete; None if all completed."""
+        return sweep.failure(self.launched)
+
+    def _compose(
+        self, job_overrides: Sequence[Sequence[str]], first: int
+    ) -> tuple[list[DictConfig], list[dict[str, Any]]]:
+        folder = Path(str(self.config.hydra.sweep.dir)).absolute()
+        configs = [self.loader.load_sweep_config(self.config, list(overrides)) for overrides in job_overrides]
+        for index, config in enumerate(configs, first):
+            _job_folder(folder, config, index)
+        return configs, [_plain_values(config, folder) for config in configs]
+
+    def _engine_of(
+        self, jobs: Sequence[sweep.Job], values: Sequence[Mapping[str, Any]], stack: ExitStack
+    ) -> Engine:
+        """Return the engine of a batch, which is closed with `stack` or, in a search, with the search."""
+        if self._search is None or all(job.completed for job in jobs):
+            return stack.enter_context(closing(self._engine(jobs, values)))
+        if self._search_engine is None:
+            self._search_engine = self._search.enter_context(closing(self._engine(jobs, values)))
+        return self._search_engine
+
+    def _summarise(self, folder: Path, config: Mapping[str, Any]) -> None:
+        from framework.sweeps import comparison
+
+        comparison.summarise(folder, [job.overrides for job in self.launched], config)
 
     def _jobs(
         self, folder: Path, configs: Sequence[DictConfig], job_overrides: Sequence[Sequence[str]], first: int
@@ -207,7 +275,7 @@ class PoolLauncher(EngineLauncher):
     def _engine(self, jobs: Sequence[sweep.Job], values: Sequence[Mapping[str, Any]]) -> Engine:
         from framework.modes import MODES  # imported late: Hydra imports this module at every start
 
-        several = sum(not job.completed for job in jobs) > 1
+        several = self._search is not None or sum(not job.completed for job in jobs) > 1
         if not (several and sys.platform == "linux" if self.fork is None else self.fork):
             return Pool(self.processes)
         modes = {(config.get("mode") or {}).get("name") for config in values} & set(MODES)
@@ -261,7 +329,7 @@ class RayLauncher(EngineLauncher):
         from framework.sweeps import ray_tasks
         from framework.sweeps.engines import require_module
 
-        require_module("ray", "ray")
+        require_module("ray", "ray", "hydra/launcher=ray")
         self.checked = ray_tasks.RaySettings(**check(ray_tasks.RaySettings, self.settings, "hydra.launcher"))
 
     def _engine(self, jobs: Sequence[sweep.Job], values: Sequence[Mapping[str, Any]]) -> Engine:

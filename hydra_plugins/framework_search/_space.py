@@ -1,10 +1,9 @@
-"""Domains of sweeps in Hydra's grammar, and reproducible random values from them."""
+"""Search space: the domains of sweeps in Hydra's grammar, and the overrides of its points."""
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from hashlib import sha256
 
 from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, Override, RangeSweep
 
@@ -55,6 +54,10 @@ class Interval:
             value = math.exp(least + quantile * (most - least))
         else:
             value = self.start + quantile * (self.end - self.start)
+        return self.text(value)
+
+    def text(self, value: float) -> str:
+        """Return a value, moved into the interval if necessary, as it is written in an override."""
         if self.whole:
             return str(min(max(math.floor(value), int(self.start)), int(self.end) - 1))
         value = min(max(value, self.start), math.nextafter(self.end, self.start))
@@ -79,55 +82,37 @@ def parse_space(overrides: Sequence[Override]) -> dict[str, Domain]:
         domains[override.get_key_element()] = _domain(override)
     if not any(override.is_sweep_override() for override in overrides):
         raise ConfigError(
-            "hydra/sweeper=random_search has no search space, because no override is a sweep. Add a sweep, such as "
+            "The search has no search space, because no override is a sweep. Add a sweep, such as "
             "seed=0,1,2, 'density_head.latent=range(1,9)' or "
             "'optimizer.learning_rate=tag(log,interval(1e-4,1e-2))'."
         )
     return domains
 
 
-def draw(space: Mapping[str, Domain], trials: int, seed: int) -> tuple[list[list[str]], int]:
-    """Return the overrides of different trials, and the number of draws that repeated an earlier trial.
+def overrides_of(values: Mapping[str, str]) -> list[str]:
+    """Return the overrides of a point of the space, whose values by key are written as in overrides."""
+    return [key if key.startswith("~") and not value else f"{key}={value}" for key, value in values.items()]
 
-    There are `trials` trials or, if the space has fewer points, one for each point; the points are then drawn until all
-    have occurred. So the trials of a shorter search are the first trials of a longer one.
+
+def extremes(space: Mapping[str, Domain]) -> list[list[str]]:
+    """Return the overrides of a few points whose configs show whether the values of each key are valid.
+
+    The first point has the first value of each key; any other point has another value of one key, which is each value
+    of a list and the last value of an interval or a range of numbers.
     """
-    count = min(trials, math.prod(domain.size for domain in space.values()))
-    drawn_trials: dict[tuple[str, ...], None] = {}
-    number = 0
-    while len(drawn_trials) < count:
-        values = (
-            domain.at(quantile(seed, number, key.lstrip("+"))) if domain.size > 1 else domain.at(0.0)
-            for key, domain in space.items()
-        )
-        drawn_trials[
-            tuple(_format_override(key, value) for key, value in zip(space, values, strict=True))
-        ] = None
-        number += 1
-    return [list(trial) for trial in drawn_trials], number - len(drawn_trials)
-
-
-def quantile(seed: int, trial: int, key: str) -> float:
-    """Return a pseudo-random number, uniform in [0, 1), that depends on the arguments only, not on the machine."""
-    digest = sha256(f"{seed}\0{trial}\0{key}".encode()).digest()
-    return (int.from_bytes(digest[:8], "big") >> 11) * 2.0**-53  # the 53 bits a float can hold
-
-
-def describe(space: Mapping[str, Domain], count: int, trials: int, repeated: int) -> str:
-    """Return a line that describes the search."""
-    keys = [key.lstrip("+") for key, domain in space.items() if domain.size > 1]
-    line = f"random search over {', '.join(keys) or 'a single point'}: {count} trials"
-    if count < trials:
-        line += f", which is all points of the space ({trials} were requested)"
-    return line + (f"; {repeated} draws repeated an earlier trial and are not run again" if repeated else "")
+    first = {key: domain.at(0.0) for key, domain in space.items()}
+    points = [first]
+    for key, domain in space.items():
+        last = 1 - 1e-6 if domain.size == math.inf else math.nextafter(1.0, 0.0)
+        values: Iterable[str] = [domain.at(last)]
+        if isinstance(domain, Choice) and not isinstance(domain.options, range):
+            values = map(str, domain.options)
+        points += [{**first, key: value} for value in values if value != first[key]]
+    return [overrides_of(point) for point in points]
 
 
 def _name(override: Override) -> str:
     return override.get_key_element().lstrip("+~")
-
-
-def _format_override(key: str, value: str) -> str:
-    return key if key.startswith("~") and not value else f"{key}={value}"
 
 
 def _domain(override: Override) -> Domain:

@@ -23,8 +23,8 @@ from framework.configuration.composition import folder, register
 from framework.errors import ConfigError
 from framework.modes.combine import find_members
 from framework.runs.job import find_job_folders
-from framework.sweeps import comparison
-from hydra_plugins.framework_random_search import _best, _draws
+from framework.sweeps import comparison, ranking
+from hydra_plugins.framework_search import _best, _draws, _space
 from tests.conftest import TINY, Framework, imported_by
 
 SEARCH = ["-m", "hydra/sweeper=random_search"]
@@ -32,8 +32,8 @@ SCVAE = {"/experiment@_global_": "pascal3d/scvae"}
 LEARNING_RATE = "optimizer.learning_rate=tag(log,interval(1e-4,1e-2))"
 
 
-def space(*overrides: str) -> dict[str, _draws.Domain]:
-    return _draws.parse_space(OverridesParser.create().parse_overrides(list(overrides)))
+def space(*overrides: str) -> dict[str, _space.Domain]:
+    return _space.parse_space(OverridesParser.create().parse_overrides(list(overrides)))
 
 
 def drawn(*overrides: str, trials: int = 20, seed: int = 0) -> list[dict[str, str]]:
@@ -260,6 +260,8 @@ SPACE = [LEARNING_RATE, "density_head.hidden=64,128", "batch_size=8,16,32,32"]
 class Search:
     """Searches in one folder."""
 
+    sweeper: tuple[str, ...] = tuple(SEARCH)
+
     def __init__(self, home: Path) -> None:
         self.home = home
         self.folder = home / "search"
@@ -269,7 +271,7 @@ class Search:
     def __call__(self, *arguments: str) -> tuple[int, str]:
         """Exit code and output."""
         done = subprocess.run(
-            [sys.executable, "app.py", *SEARCH, "hydra.sweep.dir=search", *arguments],
+            [sys.executable, "app.py", *self.sweeper, "hydra.sweep.dir=search", *arguments],
             cwd=self.home,
             env={**os.environ, "COLUMNS": "160"},
             capture_output=True,
@@ -341,7 +343,7 @@ def test_a_launcher_that_runs_jobs_in_this_process_will_do(tmp_path: Path) -> No
     assert yaml.safe_load((search.folder / "best.yaml").read_text()) == {"seed": 3}
 
 
-def trials(folder: Path, *values: float | None, **more: list[float]) -> list[comparison.Trial]:
+def trials(folder: Path, *values: float | None, **more: list[float]) -> list[ranking.Trial]:
     """Return trials with the results `values` (None for a failed trial) and the further measurements `more`."""
     made_trials = []
     for number, value in enumerate(values):
@@ -355,9 +357,7 @@ def trials(folder: Path, *values: float | None, **more: list[float]) -> list[com
             "better": {"accuracy": "higher"},
         }
         (home / "results.json").write_text(json.dumps(results))
-        made_trials.append(
-            comparison.Trial(home, [f"+x={number}", "y=1"], value, completed=value is not None)
-        )
+        made_trials.append(ranking.Trial(home, [f"+x={number}", "y=1"], value, completed=value is not None))
     return made_trials
 
 
@@ -370,17 +370,17 @@ def test_the_best_is_first_and_what_has_no_finite_value_last(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given = trials(tmp_path, math.nan, 2.0, None, -1.5, math.inf, 2.0)
-    ranking = comparison.rank(tmp_path, given, ["+x"])
+    result = ranking.rank(tmp_path, given, ["+x"])
     assert ranked(tmp_path) == ["3", "1", "5", "0", "2", "4"]
-    assert ranking.best == given[3]
-    assert ranking.summary == "best validation loss (nats): -1.5"
+    assert result.best == given[3]
+    assert result.summary == "best validation loss (nats): -1.5"
     said = " ".join(capsys.readouterr().out.split())
     assert "#0 (value nan), #2 (did not complete), #4 (value inf)" in said
-    assert comparison.rank(tmp_path, given, ["+x"], direction="maximize").best == given[1]
+    assert ranking.rank(tmp_path, given, ["+x"], directions=["maximize"]).best == given[1]
 
 
 def test_a_search_without_any_value_has_no_best(tmp_path: Path) -> None:
-    assert comparison.rank(tmp_path, trials(tmp_path, math.nan, None), ["+x"]).best is None
+    assert ranking.rank(tmp_path, trials(tmp_path, math.nan, None), ["+x"]).best is None
 
 
 def test_a_metric_of_the_results_ranks_its_own_way(
@@ -388,17 +388,17 @@ def test_a_metric_of_the_results_ranks_its_own_way(
 ) -> None:
     numbers = {"accuracy": [0.5, 0.7, 0.9], "parameters": [3, 1, 2], "odd": [0.1, 0.3, 0.2]}
     given = trials(tmp_path, 1.0, 2.0, None, **numbers)
-    assert comparison.rank(tmp_path, given, [], "accuracy").best == given[1], "that of a failed trial is none"
+    assert ranking.rank(tmp_path, given, [], ["accuracy"]).best == given[1], "that of a failed trial is none"
     assert "accuracy was computed on the test split" in capsys.readouterr().out
-    assert comparison.rank(tmp_path, given, [], "accuracy", "minimize").best == given[0]
-    assert comparison.rank(tmp_path, given, [], "parameters").best == given[1], "costs are to be low"
-    assert comparison.rank(tmp_path, given, [], "odd", "maximize").best == given[1]
+    assert ranking.rank(tmp_path, given, [], ["accuracy"], ["minimize"]).best == given[0]
+    assert ranking.rank(tmp_path, given, [], ["parameters"]).best == given[1], "costs are to be low"
+    assert ranking.rank(tmp_path, given, [], ["odd"], ["maximize"]).best == given[1]
     with pytest.raises(ConfigError, match=r"has no known direction\. Set hydra\.sweeper\.direction"):
-        comparison.rank(tmp_path, given, [], "odd")
+        ranking.rank(tmp_path, given, [], ["odd"])
     with pytest.raises(
         ConfigError, match=r"no trial has this number\. Did you mean 'accuracy'\? The trials have: accuracy, "
     ):
-        comparison.rank(tmp_path, given, [], "acuracy")
+        ranking.rank(tmp_path, given, [], ["acuracy"])
 
 
 def completed(
@@ -538,9 +538,11 @@ def test_the_sweeper_costs_other_commands_nothing() -> None:
         "mlflow",
         "matplotlib",
         "rich",
+        "optuna",
         "framework.sweeps.comparison",
+        "framework.sweeps.ranking",
     }
-    assert not heavy & imported_by("hydra_plugins.framework_random_search")
+    assert not heavy & imported_by("hydra_plugins.framework_search")
 
 
 def test_jobs_are_found_however_deep_they_lie_and_those_of_a_sweep_below_are_not(tmp_path: Path) -> None:
@@ -585,6 +587,6 @@ def test_a_job_whose_results_cannot_be_read_is_left_out_of_the_table(
         (tmp_path / "3" / "results.json").write_text(damage)
     assert [row["x"] for row in table(tmp_path)] == ["1", "2"]
     assert (str(tmp_path / "3" / "results.json") in caplog.text) == (damage is not None)
-    given = [comparison.Trial(tmp_path / str(x), [f"x={x}"], float(-x), completed=True) for x in (1, 2, 3)]
-    assert comparison.rank(tmp_path, given, ["x"], "milliseconds_per_sample").best == given[0]
+    given = [ranking.Trial(tmp_path / str(x), [f"x={x}"], float(-x), completed=True) for x in (1, 2, 3)]
+    assert ranking.rank(tmp_path, given, ["x"], ["milliseconds_per_sample"]).best == given[0]
     assert ranked(tmp_path) == ["1", "2", "3"]

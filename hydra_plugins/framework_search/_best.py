@@ -17,6 +17,11 @@ OF_THE_RUN = ("logger", "mode", "debug", "threads", "workers", "resume")
 """Keys that do not change the results of a trial; they are no part of the experiment and stay on the command line."""
 
 
+def counts(key: str) -> bool:
+    """Return whether an override of a key can change the results of a trial."""
+    return key.lstrip("+~").partition(".")[0] not in OF_THE_RUN
+
+
 def write_best(folder: Path, overrides: Sequence[str], loader: ConfigLoader, origin: str) -> None:
     """Write the experiment of the best trial, which has `overrides`, to best.yaml in `folder`.
 
@@ -65,7 +70,7 @@ def build_experiment(overrides: Sequence[str], loader: ConfigLoader, origin: str
         key, value = override.key_or_group, override.value()
         if key == "experiment":
             base = None if value is None else str(value)
-        elif key.partition(".")[0] in OF_THE_RUN or _only_on_a_command_line(override):
+        elif not counts(key) or _only_on_a_command_line(override):
             remaining.append(text)
         elif key in AFTER:
             added.append({f"/{key}@_global_": value})
