@@ -269,7 +269,8 @@ The last five columns of the table compare the batched fits of the spectra with 
 `sum of squares ≤ SciPy's` is the share of voxels where the batched fit is at least as good. `same minimum` is the
 share of voxels where the parameters are well determined and both sums of squares agree. `parameters agree` is the
 share of these where every parameter agrees to 1e-6: the difference is at most 1e-6 of the parameter, or 1e-6 of 1 %
-of its permitted range if that is larger. The column `batched nearer` is the share of the remaining voxels where the
+of its permitted range if that is larger. Of the voxels with the
+same minimum where a parameter differs by more, `batched nearer` is the share where the
 batched fit is nearer to the minimum. `warnings` is the number of voxels for which the batched fit reports a problem.
 
 With 15 parameters per spectrum, the batched fit of this project starts from two sets of starting values and keeps the

@@ -497,7 +497,7 @@ def _why_no_numbers(columns: Columns, name: str, setting: str) -> str:
 
 
 def _other_reading(cell: str, writing: Writing) -> text.Suggestion | None:
-    """Return how to read a cell that is a number in another notation than the table's; None for any other cell."""
+    """Return the settings that read a cell as a number in another notation than the table's; None for other cells."""
     if not writing.plain and text.parse_number(cell) is not None:
         digits = cell.lstrip("+-")
         grouped = writing.sign == "," and re.fullmatch(GROUPED_BY_POINTS, digits)

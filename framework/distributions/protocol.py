@@ -46,7 +46,7 @@ def marginal(density: Distribution, index: int) -> Distribution:
     if density.event_shape == (1,) and index == 0:
         return density
     raise UserError(
-        f"{type(density).__name__} has no marginal for one of its {tuple(density.event_shape)} numbers. "
+        f"{type(density).__name__} describes a target of shape {tuple(density.event_shape)} and has no marginal for one number of it. "
         "Register one with `framework.distributions.protocol.marginal.register`, or leave out the "
         "metric or figure that needs it."
     )

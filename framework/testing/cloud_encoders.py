@@ -24,7 +24,7 @@ def different_clouds(points: int, columns: int) -> list[Tensor]:
 
 
 def batch_of(lengths: Sequence[int], columns: int = 3, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Return clouds of these lengths away from the origin, padded; their values do not depend on the dtype."""
+    """Return padded clouds with these numbers of points, far from the origin, equal in every dtype up to rounding."""
     generator = torch.Generator().manual_seed(0)
     clouds = [torch.randn(length, columns, generator=generator, dtype=torch.float64) for length in lengths]
     return pad([cloud.to(dtype) * 30 + 7 for cloud in clouds])

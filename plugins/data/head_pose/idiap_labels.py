@@ -100,8 +100,8 @@ def _values(content: h5py.File, dataset: Any, most: int) -> np.ndarray:
     plain = dataset.dtype.kind in "iuf" or dataset.dtype == h5py.ref_dtype
     if not plain or max(dataset.size, chunk) > most:
         raise ValueError(
-            f"a dataset has the type {dataset.dtype}, the shape {dataset.shape} and chunks of {dataset.chunks}; "
-            f"expected a label of at most {most} numbers or references"
+            f"the label {dataset.name} has the type {dataset.dtype}, the shape {dataset.shape} and chunks of "
+            f"{dataset.chunks}; expected numbers or references, at most {most} in all and in a chunk"
         )
     if dataset.external or dataset.is_virtual or dataset.file.filename != content.filename:
         raise ValueError("the values of a dataset lie in another file; expected all values in this file")

@@ -11,7 +11,7 @@ MARGIN = 8
 
 
 def side_view(frames: Float[np.ndarray, "frame 5"]) -> UInt8[np.ndarray, "height width 3"]:
-    """Return an image of frames (`framework.flights.frames.PARTS`), with y to the right and z up, in the same scale.
+    """Return a picture of the ball at each frame, seen from the side: y to the right and z up, in the same scale.
 
     Early frames are pale, and the last frame is red.
     """

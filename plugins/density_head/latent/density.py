@@ -131,9 +131,10 @@ def sampled_mixture(latent: Latent, points: NormalPoints, effort: Effort) -> Sam
 class LatentDensity(Distribution):
     """The density p(φ|x) = ∫ p(φ|x,z) p(z|x) dz (eq. 3.12, 3.21).
 
-    `log_prob` is the log of a mean weight at points z. The points are sampled once, so that log_prob is a fixed
-    function of φ. Its expectation over the points is below the true log-density and rises towards it with the number of
-    samples. With a tolerance, the samples of each value are doubled until the estimated error is below the tolerance.
+    `log_prob` is the logarithm of the mean of importance weights at random values of z. These values are sampled once,
+    so that log_prob is a fixed function of φ. Its expectation over the values of z is below the true log-density and
+    rises towards it with their number. With a tolerance, the number of values of z is doubled for each φ until the
+    estimated error is below the tolerance.
     `sample` draws a new z for every value. `entropy`, `mode`, `median` and `marginal` are those of `mixture`.
     """
 

@@ -70,9 +70,9 @@ class Canvas:
     """Settings of a U-Net's input and output: colours, padding, crop, precision and unshuffling.
 
     Attributes:
-        colors: number of first outputs that are colours; the other outputs stay raw.
+        colors: number of the leading output channels that are colours; the other channels stay raw.
         stride: number of pixels. The network reads images whose sides are multiples of this number; other images are
-            padded with empty ground.
+            padded with empty background.
         crop: margin around the subject's box, pixels; None computes everything.
         precision: precision of evaluation, for float32 weights.
         shuffle: side, pixels, of the squares whose values the last convolution returns as channels.

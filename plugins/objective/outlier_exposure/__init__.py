@@ -1,1 +1,1 @@
-"""Outlier exposure: high uncertainty on inputs that are not data (thesis §2.3.5)."""
+"""Outlier exposure: high uncertainty on outliers (thesis §2.3.5)."""

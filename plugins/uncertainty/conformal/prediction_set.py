@@ -42,8 +42,8 @@ class PredictionSet(Mixture, ValueSet):
     - "mass": -log of the probability of all values with a smaller density than y, nats. The set is the smallest region
       of one probability, the same for every item (for classes Romano, Sesia & Candès 2020, for numbers a
       highest-density region). For classes, a share u(x) in (0, 1) of p(y) itself is added to this probability; u(x)
-      looks random, but is a function of the density. Without it, all wrong labels of two classes and most correct ones
-      would have equal scores.
+      looks random, but is a function of the density. Without u(x), the least likely class would always have an infinite
+      score, whatever its probability.
 
     Both scores are functions of the density and the value alone, as split conformal prediction requires: on
     exchangeable data the set has its stated coverage for any density (Vovk, Gammerman & Shafer 2005, §4.1).
