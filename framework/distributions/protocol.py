@@ -46,8 +46,8 @@ def marginal(density: Distribution, index: int) -> Distribution:
     if density.event_shape == (1,) and index == 0:
         return density
     raise UserError(
-        f"{type(density).__name__} describes a target of shape {tuple(density.event_shape)} and has no marginal for one number of it. "
-        "Register one with `framework.distributions.protocol.marginal.register`, or leave out the "
+        f"{type(density).__name__} describes a target of shape {tuple(density.event_shape)} and has no marginal for "
+        "one number of it. Register one with `framework.distributions.protocol.marginal.register`, or leave out the "
         "metric or figure that needs it."
     )
 

@@ -352,8 +352,8 @@ def check_texture(texture: Texture, count: int, channels: int | None) -> Texture
         raise ValueError(
             f"texture.faces has {len(texture.faces)} faces"
             + ("" if shown is None else f" and texture.shown has the shape {tuple(shown.shape)}")
-            + f", but the scene has {count} faces. Give texture.faces, and texture.shown if there is one, a row for each "
-            "face of the scene."
+            + f", but the scene has {count} faces. Give texture.faces, and texture.shown if there is one, a row for "
+            "each face of the scene."
         )
     if shown is not None and shown.dtype not in INDEX_TYPES:
         raise ValueError(f"texture.shown: got {shown.dtype}, expected whole numbers, e.g. torch.int64.")
