@@ -91,9 +91,9 @@ class SelfTraining(ABC):
     of the trainer and the optimiser have no effect, and objectives are refused.
 
     Attributes:
-        rows: numbers of the samples of the next prediction among those that trained, (batch,); the wrapper then
-            predicts each sample by the models that did not see it. None: all models predict. The attribute is set by
-            `held_out` only.
+        rows: for each sample of the next prediction, its number among the samples that trained the models, (batch,);
+            the wrapper then predicts the sample by the models that did not see it. None: all models predict. The
+            attribute is set by `held_out` only.
     """
 
     rows: Tensor | None = None
@@ -102,7 +102,9 @@ class SelfTraining(ABC):
     def train_models(
         self, inputs: Float[Tensor, "sample *input"], target: Tensor, *, seed: int, batch_size: int
     ) -> float:
-        """Train and calibrate all models in place; return the mean loss of samples by models that did not see them.
+        """Train and calibrate all models in place, and return the mean loss over all samples, nats.
+
+        For the loss, each sample is predicted by the models that did not see it.
 
         Args:
             inputs: inputs of the training split, then those of the validation split.
@@ -119,10 +121,11 @@ def self_training(predictor: Predictor) -> SelfTraining | None:
 
 @contextmanager
 def held_out(predictor: Predictor, batch: Batch) -> Iterator[None]:
-    """Predict the samples of a batch by models that did not see them inside the block.
+    """Let each sample of a batch be predicted, inside the block, by models that were not trained on it.
 
-    It has an effect if a wrapper trains its models itself (`SelfTraining`), and the batch says which of the samples
-    that trained it holds (the field "row", which the framework adds for calibration).
+    The block has an effect only if a wrapper trains its models itself (`SelfTraining`), and the batch has the field
+    "row": the number of each sample among the samples that trained the models. The framework adds this field for
+    calibration.
     """
     wrapper = self_training(predictor)
     if wrapper is None:
@@ -184,7 +187,7 @@ class Joining(ABC):
     @classmethod
     @abstractmethod
     def parameters_of(cls, count: int) -> dict[str, Any]:
-        """Return the config that builds such a wrapper around `count` members, for example {"members": count}."""
+        """Return the config that builds this wrapper around `count` members, for example {"members": count}."""
 
     @abstractmethod
     def join(self, members: Sequence[Predictor]) -> None:

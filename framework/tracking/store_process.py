@@ -119,7 +119,7 @@ def started_early() -> Iterator[None]:
 
 
 def take_process() -> StoreProcess:
-    """Return the process of `started_early`, or one that is started when it is needed."""
+    """Return the process that `started_early` has started; without it, a process that starts at its first use."""
     return _early.pop() if _early else StoreProcess()
 
 

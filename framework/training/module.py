@@ -97,7 +97,7 @@ class Training(pl.LightningModule):
         self.cached = cached
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute; the name of the current hook, which Lightning sets 50 times in a step, by the short way."""
+        """Set an attribute; skip torch's slow checks for the hook name, which Lightning sets 50 times in each step."""
         if name == "_current_fx_name":  # the checks of torch's modules would take 0.1 ms in each step
             self.__dict__[name] = value
         else:
@@ -178,7 +178,7 @@ class Training(pl.LightningModule):
         return trainer.datamodule.batches.orders
 
     def _share(self, batch: Batch) -> Share | None:
-        """Return which rows of the whole batch this rank has; None if a single process trains."""
+        """Return the rows of the whole batch that this rank has; None if a single process trains."""
         return rank_share(len(batch["index"]), self.device) if self.trainer.world_size > 1 else None
 
     def on_validation_batch_start(self, batch: Batch, batch_index: int, dataloader_idx: int = 0) -> None:
@@ -244,7 +244,7 @@ class Training(pl.LightningModule):
         ]
 
     def _predictor_parameters(self) -> list[nn.Parameter]:
-        """Return the parameters that the settings `optimizer` train: all except those of the adversaries."""
+        """Return the parameters to which the settings `optimizer` apply: all except those of the adversaries."""
         excluded = {
             id(parameter) for objective, _ in self._adversaries() for parameter in objective.parameters()
         }
@@ -256,7 +256,7 @@ class Training(pl.LightningModule):
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Clip gradients as Lightning does, but each adversary, and each of several models, separately.
+        """Clip gradients as Lightning does, but separately for each adversary and for each of several models.
 
         Unlike Lightning, it also clips with fused optimisers in mixed precision.
         """
@@ -378,7 +378,7 @@ class KeepCheckpoints(BatchCallback):
             self.save_last(trainer)
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Record the loss of the weights to keep and, with `keep="best"`, save best.ckpt if it is the lowest so far."""
+        """Record the loss of the weights to keep; with `keep="best"`, save best.ckpt if no loss was lower so far."""
         if trainer.sanity_checking or trainer.state.fn != "fit":
             return
         loss = float(trainer.callback_metrics["validation/loss"])

@@ -46,14 +46,17 @@ def warmup_factor(step: int, warmup_steps: int) -> float:
 
 
 def smooth_factor(step: int, *, total: int | None, warmup_steps: int = 0) -> float:
-    """Return the warm-up's factor at a step, times a half period of a cosine from 1 to 0 in `total` steps, if given."""
+    """Return the warm-up's factor at a step, multiplied by a cosine decay unless `total` is None.
+
+    The decay is half a period of a cosine, which falls from 1 to 0 in `total` steps.
+    """
     if total is None:
         return warmup_factor(step, warmup_steps)
     return warmup_factor(step, warmup_steps) * 0.5 * (1 + math.cos(math.pi * min(1.0, step / total)))
 
 
 def step_factor(step: int, *, starts: list[int], factor: float, warmup_steps: int = 0) -> float:
-    """Return the warm-up's factor at a step, times `factor` once for each of the `starts` that are reached."""
+    """Return the warm-up's factor at a step, multiplied by `factor` once for each step in `starts` that is reached."""
     return warmup_factor(step, warmup_steps) * factor ** sum(step >= start for start in starts)
 
 

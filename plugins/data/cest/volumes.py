@@ -101,7 +101,7 @@ def _nifti(file: Path) -> Mapping[str, Any]:
 
 
 def _volume(arrays: Mapping[str, Any], size: int) -> Volume:
-    """Return the volume in the arrays of a file of `size` bytes."""
+    """Return the volume that the arrays of a file hold; `size` is the size of the file, bytes."""
     name = next((name for name in SPECTRA if name in arrays), None)
     if name is None or "offsets" not in arrays:
         raise DataError(
@@ -190,7 +190,10 @@ def _divide_by_m0(spectra: np.ndarray, offsets: np.ndarray, m0: Any) -> tuple[np
 
 
 def _mask(mask: Any, spectra: np.ndarray) -> Bool[np.ndarray, "x y z"]:
-    """Return which voxels are read: those where `mask` is above 0, or without a mask those with any number but 0."""
+    """Return a mask of the voxels to read.
+
+    They are the voxels where `mask` is above 0 or, if `mask` is None, those whose spectrum holds a number other than 0.
+    """
     if mask is None:
         return np.asarray(np.nan_to_num(spectra, nan=1.0).any(-1))
     return np.asarray(np.nan_to_num(to_real(mask, "mask").reshape(spectra.shape[:-1])) > 0)

@@ -54,7 +54,7 @@ class Anatomy:
 
     @property
     def on_arm(self) -> Bool[np.ndarray, "vertices"]:
-        """Return which vertices belong to an arm."""
+        """Return a mask of the vertices that belong to an arm."""
         return self.arms > 0.5
 
 

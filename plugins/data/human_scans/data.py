@@ -336,7 +336,7 @@ def _common_size(root: Path, subjects: Sequence[Subject]) -> tuple[tuple[int, in
 
 
 def _digest(subjects: Mapping[str, Sequence[Subject]]) -> str:
-    """Return a hash of names, meshes, cameras, and the checksums at the ends of photographs and masks."""
+    """Return a hash of names, meshes and cameras, and of the checksums in the files of photographs and masks."""
     digest = hashlib.sha256()
     for split, some in subjects.items():
         for subject in some:

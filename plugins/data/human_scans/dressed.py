@@ -199,7 +199,7 @@ class Wardrobe:
             posed: vertices of the bare body in the pose of the scan, metres.
             scan: the scan.
             visible: whether a scanner sees each point of the scan.
-            random: source of the remaining error.
+            random: source of the random error that is added to the distances.
         """
         points = scan.vertices[visible]
         tree = KDTree(points, balanced_tree=False, compact_nodes=False)

@@ -22,7 +22,8 @@ class Garment(NamedTuple):
     """One piece of clothing.
 
     Attributes:
-        inside: signed distance from its border, metres, above 0 if it covers a vertex.
+        inside: signed distance of each vertex from the garment's border, metres; above 0 if the garment covers the
+            vertex.
         thickness: distance from the skin (or from the garment under it), metres.
         wrinkles: displacement outwards, metres, with a mean near 0.
         colors: linear RGB of every vertex; it has a meaning only inside the garment.

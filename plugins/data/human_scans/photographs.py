@@ -81,7 +81,7 @@ def _camera(
 def take_photographs(renderer: Renderer, scene: Scene, cameras: Sequence[Camera]) -> list[Photograph]:
     """Return a photograph of the scene, whose colours are red, green and blue, from each camera.
 
-    Every pixel is the mean linear RGB of those of its SAMPLES² samples that lie on the subject.
+    Each pixel has SAMPLES² samples. Its colour is the mean, in linear RGB, of the samples that lie on the subject.
     """
     larger = [
         Scene(scene.vertices, scene.faces, _with_cover(scene.colors), _finer(camera)) for camera in cameras

@@ -164,7 +164,7 @@ def _collect(
 
 
 def _folders(root: Path, remedy: str) -> list[Path]:
-    """Return the folders in `root`, sorted, without those whose names begin with a point or an underscore."""
+    """Return the folders in `root`, sorted, without those whose names begin with a dot or an underscore."""
     if not root.is_dir():
         raise DataError(f"data.root = {root} does not exist or is no folder. {remedy}")
     return sorted(path for path in root.iterdir() if path.is_dir() and path.name[0] not in "._")

@@ -91,7 +91,7 @@ def _draw_all(part: Path, category: str, images: int, seed: int, renderer: Rende
 
 
 def _names(images: int) -> Iterator[tuple[str, str]]:
-    """Yield the list and the name of every image."""
+    """Yield for each image the list that it belongs to, such as "pascal_val", and its name."""
     ends = np.round(np.cumsum([0.0, *SHARES.values()]) * images).astype(int)
     for split, first, last in zip(SHARES, ends, ends[1:], strict=False):
         for number in range(first, last):

@@ -1,7 +1,8 @@
 """Reading of PASCAL3D+ release 1.1: its folders, its lists of images, and its annotations in MATLAB files.
 
-Annotations/<class>_{pascal,imagenet}/<name>.mat, Images/<class>_{pascal,imagenet}/<name>.{jpg,JPEG},
-Image_sets/<class>_imagenet_{train,val}.txt, PASCAL/VOCdevkit/VOC2012/ImageSets/Main/<class>_{train,val}.txt.
+The release has the files Annotations/<class>_{pascal,imagenet}/<name>.mat,
+Images/<class>_{pascal,imagenet}/<name>.{jpg,JPEG}, Image_sets/<class>_imagenet_{train,val}.txt and
+PASCAL/VOCdevkit/VOC2012/ImageSets/Main/<class>_{train,val}.txt.
 """
 
 import math

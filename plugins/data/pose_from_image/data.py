@@ -61,7 +61,7 @@ class Apart:  # this name is part of stored fingerprints
 class PoseFromImage(Data):
     """Synthetic images that show one body each; the target is the body's position, pose and shape.
 
-    An input is (4, height, width): red, green, blue, linear and black beyond the body, and the share of each pixel that
+    An input is (4, height, width): the linear RGB of each pixel, black beyond the body, and the share of the pixel that
     the body covers. Targets are the parameters of a `ParametricBody`; 0 is the nominal position, pose and shape. A
     sample is a function of (`data_seed`, split, number), drawn when it is fetched. Batches also hold the image as
     "color" (batch, height, width, 3), and "mask" (batch, height, width), bool, true for pixels of which the body covers

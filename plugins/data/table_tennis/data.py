@@ -42,10 +42,10 @@ Share = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)]
 class TableTennis(Data):
     """Future positions of a ball, predicted from its observed positions (thesis §4.2); simulated if no root is given.
 
-    An input is the flattened array of the last `observed` frames, with the numbers `PARTS` for each frame. The target
-    is the recorded positions at the next `future` multiples of the step, metres. Batches also hold "flight", the number
-    of the flight, and "truth", with the shape of the target: the positions without noise if the flight was simulated,
-    otherwise the target itself.
+    An input is the flattened array of the last `observed` frames, with five numbers for each frame: time, x, y, z, and
+    whether the ball was seen (`PARTS`). The target is the recorded positions at the next `future` multiples of the
+    step, metres. Batches also hold "flight", the number of the flight, and "truth", with the shape of the target: the
+    positions without noise if the flight was simulated, otherwise the target itself.
 
     All windows of a flight are in one split; a flight that is recorded twice counts once.
 

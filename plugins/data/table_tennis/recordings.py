@@ -202,7 +202,7 @@ def _rate_remedy(usual: float, step: float, times_in: TimesIn) -> str:
 
 
 def _millimetres_hint(positions: Float[np.ndarray, "frame 3"]) -> str:
-    """Return advice if most positions are too large for metres."""
+    """Return advice about millimetres if most positions are too large for metres, otherwise an empty text."""
     usual = float(np.median(np.abs(positions).max(1)))
     return "; divide all positions by 1000 if they are in millimetres" if usual > FARTHEST else ""
 

@@ -1,4 +1,4 @@
-"""Columns of words as numbers: one column of 0 and 1 for each level, the different words of a column."""
+"""Columns of words as numbers: one column of 0 and 1 for each level. A level is a word that occurs in the column."""
 
 import logging
 from collections import Counter
@@ -22,7 +22,10 @@ def name_of(column: str, level: str) -> str:
 
 
 def expand_words(cells: Columns, but: Collection[str]) -> tuple[Columns, Mapping[str, tuple[str, ...]]]:
-    """Return the table with a column for each level of each column of words, and the names of these by column.
+    """Return the table with each column of words replaced by one column of 0 and 1 for each of its levels.
+
+    The names of the new columns are returned too, by the name of the column that they replace. Columns with fewer than
+    two or more than MOST_LEVELS levels stay as they are.
 
     Args:
         cells: The table.
@@ -44,7 +47,12 @@ def expand_words(cells: Columns, but: Collection[str]) -> tuple[Columns, Mapping
 
 
 def add_levels(cells: Columns, names: Sequence[str]) -> Columns:
-    """Return a table with the columns of levels among `names` that it lacks, and log levels that are not among them."""
+    """Return a table to which the columns of levels that it lacks are added, and log levels that have no column.
+
+    Args:
+        cells: The table, with columns of words.
+        names: Columns that a model reads, among them the columns of levels.
+    """
     columns = dict(cells.cells)
     for column, levels in known_levels(names, cells.cells).items():
         for level in levels:
@@ -55,11 +63,11 @@ def add_levels(cells: Columns, names: Sequence[str]) -> Columns:
 
 
 def known_levels(names: Sequence[str], present: Collection[Any]) -> dict[str, list[str]]:
-    """Return the levels that a model reads, by the name of a column in `present`.
+    """Return the levels that a model reads of each column of words in a table, by the name of the column.
 
     Args:
         names: Columns that the model reads.
-        present: Columns of a table.
+        present: Columns of the table.
     """
     levels: dict[str, list[str]] = {}
     for name in names:
@@ -70,7 +78,12 @@ def known_levels(names: Sequence[str], present: Collection[Any]) -> dict[str, li
 
 
 def levels_in_memory(user_data: Any, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return the columns of levels among `names`, for rows in memory that have the columns of words themselves."""
+    """Return the columns of levels that a model reads, computed from columns of words in memory.
+
+    Args:
+        user_data: Rows in memory, such as a DataFrame.
+        names: Columns that the model reads, among them the columns of levels.
+    """
     columns: dict[str, np.ndarray] = {}
     for column, levels in known_levels(names, [*user_data]).items():
         words = np.array([str(word).strip() for word in np.atleast_1d(np.asarray(user_data[column], object))])

@@ -348,7 +348,7 @@ def _choose_inputs(cells: Columns, question: Question) -> ColumnChoice:
 
 
 def _choose(cells: Columns, question: Question, columns: tuple[str, ...]) -> ColumnChoice:
-    """Return the choice of `columns` as input, with the reasons why all columns that are not read are left out."""
+    """Return the choice of `columns` as input, with a reason for each column that is not read."""
     known = (*columns, *question.target, SPLIT, GROUP)
     unread = [name for name in cells.cells if name not in known]
     left_out = dict(cells.left_out) | dict.fromkeys(unread, "not among the columns to read")

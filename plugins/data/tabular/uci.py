@@ -58,7 +58,7 @@ class UCI(Tabular):
         return super()._table
 
     def _assign_splits(self, cells: Columns, question: Question) -> tuple[Columns, Question]:
-        """Return the cells with a column `split` instead of the marks, and the column before them as the target."""
+        """Return the cells with a column `split` in place of `test_in_splits`, and settings that name the target."""
         names = list(cells.cells)
         if len(names) < 3 or names[-1] != MARKS:
             raise DataError(

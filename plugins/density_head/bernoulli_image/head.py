@@ -25,7 +25,7 @@ LEAST, MOST, ROUNDS = 1e-2, 1e2, 60
 
 
 class BernoulliImageHead(DensityHead):
-    """Bernoulli densities over the numbers of an image (`BernoulliImage`), read from an image on white ground.
+    """Bernoulli densities over the numbers of an image (`BernoulliImage`), read from an image on white background.
 
     Features are (channel, height, width), with one channel for each channel of the target. A feature of 1 is the white
     of the background, where the number is almost certainly 0; a feature of 0 is black, where the number is almost

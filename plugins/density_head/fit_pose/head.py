@@ -36,7 +36,7 @@ class FitPoseHead(DensityHead, Fitted):
     mean. `calibrate` sets its standard deviations to the root mean square errors on the validation split, separately
     for fits whose image agrees with the input to within `enough` and for the other fits. Before calibration, and for
     inputs that are not images of a body (numbers outside [0, 1], or no silhouette), the density is that of the training
-    split: mean 0, and the standard deviations of the targets. The gradient of the density in the image is set to 0.
+    split: mean 0, and the standard deviations of the targets. Its gradient with respect to the image is set to 0.
 
     Attributes:
         steps: largest number of steps of a stage (a knob).

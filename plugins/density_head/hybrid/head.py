@@ -22,7 +22,7 @@ LARGEST_LOG_UNIT = 20.0
 class HybridHead(DensityHead):
     """A learned density around a mean that the encoder gives, such as that of a physical model.
 
-    The first features that the head reads are the mean, in the target's unit and order. Then follows one number for
+    The features that the head reads begin with the mean, in the target's unit and order. Then follows one number for
     each number of the target: the logarithm of the unit in which the component describes the distance of the target
     from the mean. A network of two hidden layers reads all features and predicts the raw parameters of the component.
     Unless the component has trained parameters of its own, the last layer of the network starts at 0, so that at first

@@ -21,8 +21,8 @@ class LatentDecoder(nn.Module):
     The two linear paths prevent a mixture over several numbers from collapsing. The path linear in the features shifts
     all components together. So what every component must learn (an angle that the image determines) does not favour the
     component that learned it first. The matrix `spread` of the path linear in z makes components differ from the first
-    step, and the features modify it. Two opposite directions have a mean without information and differ only in the
-    second moment; this path can learn from the second moment at first order.
+    step, and the features modify it. If a target has either of two opposite directions, its mean holds no information
+    about them, but its second moment does; this path can learn from the second moment at first order.
 
     Args:
         latent: dimensions of z.

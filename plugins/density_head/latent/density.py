@@ -65,7 +65,7 @@ class Latent(ABC):
     def example(self) -> Distribution:
         """Return the components for raw parameters of 0, batch_shape (*batch).
 
-        They have the support of all components, and no decoder is run for them.
+        They have the same support as all other components, and no decoder is run for them.
         """
         return self.component(self.center.new_zeros(*self.center.shape[:-1], self.size))
 
@@ -80,7 +80,7 @@ class Latent(ABC):
     def log_weights(
         self, value: Tensor, items: Int[Tensor, "row"], noise: Float[Tensor, "*draw row latent"]
     ) -> Float[Tensor, "*draw row"]:
-        """Return the log of weights, nats, whose expectation over the noise is the density p(φ|x) at `value`.
+        """Return the log of importance weights, nats; their expectation over the noise is p(φ|x) for φ in `value`.
 
         Args:
             value: (row, *event).

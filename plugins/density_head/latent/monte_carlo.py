@@ -277,8 +277,8 @@ class NormalPoints:
         replicates: number R of replicates, the independent parts of an item's points.
         dimensions: dimensions of z.
         dtype, device: dtype and device of the points.
-        kept_count: number of first points of each replicate that stay in memory after their first use, because many
-            values are evaluated at the same points; 0 is used if this would exceed LARGEST_KEPT.
+        kept_count: number of points at the start of each replicate that stay in memory after their first use,
+            because many values are evaluated at the same points; 0 is used if this would exceed LARGEST_KEPT.
     """
 
     def __init__(

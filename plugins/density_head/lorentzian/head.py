@@ -23,8 +23,8 @@ class LorentzianHead(DensityHead, Fitted):
 
     The density is normal, and its covariance follows from the Jacobian of the fit. The head reads spectra of
     `data=cest` unchanged, without an encoder, and needs no training and no calibration. The names of the target's
-    numbers decide which preset of parameters (framework.spectra.spectrum) is fitted. The gradient of the density in the
-    spectrum is set to 0.
+    numbers decide which preset of parameters (framework.spectra.spectrum) is fitted. The gradient of the density
+    with respect to the spectrum is set to 0.
 
     Attributes:
         steps: largest number of steps of a fit (a knob).

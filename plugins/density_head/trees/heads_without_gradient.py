@@ -59,7 +59,7 @@ def single(features: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 def with_gradient_of_0(
     numbers: Float[Tensor, "*batch_and_more"], raw: Float[Tensor, "*batch size"]
 ) -> Float[Tensor, "*batch_and_more"]:
-    """Return `numbers` with a gradient of 0 in `raw`.
+    """Return `numbers` with a gradient of 0 with respect to `raw`.
 
     The framework needs a gradient from every head. The output of trees is piecewise constant in `raw`, so that its
     gradient is 0.

@@ -41,7 +41,7 @@ def half_products(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def in_single(value: Tensor, mean: Tensor) -> bool:
-    """Return whether to compute in float32 alone: whether both are float32, and numbers in them may be read."""
+    """Return whether to compute in float32 alone: both angles are float32, and code may read their values."""
     if torch.compiler.is_compiling() or is_transformed():
         return False
     return value.dtype == mean.dtype == torch.float32

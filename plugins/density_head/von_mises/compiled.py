@@ -150,7 +150,7 @@ _root_half = _constant("0x1.6a09e6p-1", "0x1.6a09e667f3bcdp-1")
 
 @no_type_check
 def _peak(part) -> Any:
-    """Return the polynomial "log_peak" (coefficients.py) at `part` = 2/(κ+2), and its derivative by `part`."""
+    """Return the polynomial "log_peak" (coefficients.py) at `part` = 2/(κ+2), and its derivative there."""
 
 
 @overload(_peak, inline="always")
@@ -249,7 +249,7 @@ def log_prob(value, mean, concentration, result):
 @compiled
 @no_type_check
 def log_prob_and_slopes(value, mean, concentration, result, by_mean, by_concentration):
-    """Fill `result` as `log_prob`, and the other arrays with its derivatives by the mean and by κ."""
+    """Fill `result` as `log_prob`, and other arrays with its derivatives with respect to the mean and to κ."""
     use_widest_registers()
     lost = 0
     for i in range(len(result)):

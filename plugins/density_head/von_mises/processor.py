@@ -55,7 +55,7 @@ def multiply(factor: Tensor, *tensors: Tensor) -> list[Tensor]:
 
 
 def density(value: Tensor, mean: Tensor, concentration: Tensor, *, slopes: bool) -> tuple[Tensor, ...] | None:
-    """Return log p, and with `slopes` also its derivatives by the mean and by κ, without gradients.
+    """Return log p; with `slopes`, also its derivatives with respect to the mean and to κ; without gradients.
 
     The arguments are broadcast and have one dtype. If compiled code does not apply, if there are too few elements, or
     if a difference of angles is beyond its reach, the function returns None.

@@ -14,7 +14,7 @@ WIDEST = 8.0
 
 
 class NormalScores(Encoder, FitsInputs):
-    """Each number of the flattened input, followed by the normal scores of all numbers.
+    """All numbers of the flattened input, followed by their normal scores.
 
     The score of a value is Φ⁻¹((r - ½)/n) for its rank r among n training values (Blom 1958, ch. 6; equal values share
     their mean rank), scaled to mean 0 and standard deviation 1 over the training samples. Between training values it is

@@ -43,8 +43,8 @@ class Reading(NamedTuple):
     """The part of the clouds that an encoder reads, and their normalisation.
 
     Attributes:
-        columns: number of first columns that are read.
-        most: number of first points of a cloud that are read; None for all.
+        columns: number of leading columns that are read.
+        most: number of points at the beginning of a cloud that are read; None for all.
         normalise: as in `framework.geometry.clouds.normalise_clouds`.
     """
 
@@ -92,8 +92,8 @@ def concatenate_points(
     Args:
         clouds: (batch, points, columns).
         normalise: as in `framework.geometry.clouds.normalise_clouds`, computed from all points.
-        columns: number of first columns that are read.
-        most: number of first points of a cloud that are read; None for all.
+        columns: number of leading columns that are read.
+        most: number of points at the beginning of a cloud that are read; None for all.
         dtype: dtype of the returned points.
 
     Raises:

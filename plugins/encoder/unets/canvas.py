@@ -24,7 +24,7 @@ white before training, also in regions far from a subject, from which training l
 size still suffice to change a colour.
 """
 EMPTY = 1.0
-"""Value of every channel of the input on empty ground."""
+"""Value of every channel of the input on empty background."""
 EMPTY_LOG_SCALE = -5.0
 """Initial value of the logarithms of scales: a scale of 0.007, near the error of an untrained network's white.
 
@@ -61,7 +61,7 @@ class CropReport:
 Maps = Callable[[Tensor, Iterator[Step]], Tensor]
 """Function of images and layers that returns the maps that the last convolution reads.
 
-The images are differences from the empty ground, and their sides are multiples of the stride.
+The images are differences from the empty background, and their sides are multiples of the stride.
 """
 
 
@@ -172,7 +172,7 @@ class Canvas:
 
         Args:
             raw: output of the last convolution.
-            images: images as differences from the empty ground.
+            images: images as differences from the empty background.
         """
         if self.residual:
             # Colours may lie a little beyond [0, 1]. They are not clamped: a clamped colour that should become darker

@@ -1,9 +1,9 @@
-"""Convolutions for images on an empty ground: an empty image is 0 in every layer.
+"""Convolutions for images on an empty background; an image without a subject is 0 in every layer.
 
 Maps are differences from the values that a layer would have on an infinite empty image. For such an image, a
 convolution of these differences gives 0. Normalisation and ReLU then give relu(shift), which the layer subtracts. Zero
-padding therefore continues the empty ground beyond the border in every layer, and regions far from any subject need not
-be computed.
+padding therefore continues the empty background beyond the border in every layer, and regions far from any subject need
+not be computed.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ GROUPS = 8
 
 
 class Layer(nn.Module):
-    """A convolution, normalisation and ReLU, applied to maps that are differences from the empty ground.
+    """A convolution, normalisation and ReLU, applied to maps that are differences from the empty background.
 
     Args:
         size: side of the kernel, pixels; 3 keeps the size of the image, 2 halves it.
@@ -131,18 +131,18 @@ class Layer(nn.Module):
 
 
 class FromGround(torch.autograd.Function):
-    """The function relu(gain s + offset) minus its value on the empty ground, where s are the standardised maps.
+    """The function relu(gain s + offset) minus its value on the background, where s are the standardised maps.
 
-    The maps are 0 on the empty ground. The backward pass is written out, because autograd of the same formula makes
-    many more passes over the maps. It takes into account that the moments, and with them the value on the ground, are
-    functions of the maps.
+    The maps are 0 on the empty background. The backward pass is written out, because autograd of the same formula makes
+    many more passes over the maps. It takes into account that the moments, and with them the value on the background,
+    are functions of the maps.
     """
 
     @staticmethod
     def forward(
         ctx: Any, maps: Tensor, gain: Tensor, offset: Tensor, standard: Tensor, mean: Tensor, inverse: Tensor
     ) -> Tensor:
-        """Return the maps after ReLU, minus the value on the ground.
+        """Return the maps after ReLU, minus the value on the background.
 
         Args:
             ctx: context of autograd.
@@ -170,8 +170,8 @@ class FromGround(torch.autograd.Function):
         of_ground = -_sum(gradient, gain.dtype) * (shift > 0)
         gradient = gradient * (rectified > _per_channel(-shift.relu(), rectified))
         of_offset, of_gain = _sum(gradient, gain.dtype), _sum(gradient * standard, gain.dtype)
-        # Derivatives in mean and inverse through the value on the ground. The usual formula of batch norm contains the
-        # derivatives through s.
+        # Derivatives in mean and inverse through the value on the background. The usual formula of batch norm contains
+        # the derivatives through s.
         of_mean, of_inverse = -of_ground * gain * inverse, -of_ground * gain * mean
         constant = (of_mean - gain * inverse * of_offset) / count
         standardised = -(gain * inverse * of_gain + of_inverse * inverse.square()) / count

@@ -24,8 +24,8 @@ class Slim(Encoder):
     next lower level. On the way up, a 3×3 convolution gives the channels of the upper level, each number is repeated on
     2×2 pixels, and the upper level's maps from the way down are added.
 
-    An input of 1 in every channel is empty ground, and so is everything beyond the border: sides are padded with empty
-    ground to a multiple of unshuffle × 2 ** (levels - 1) pixels.
+    An input of 1 in every channel is empty background, and so is everything beyond the border: sides are padded with
+    empty background to a multiple of unshuffle × 2 ** (levels - 1) pixels.
 
     Args:
         input_shape: (channels, height, width); the network also reads images of other heights and widths.

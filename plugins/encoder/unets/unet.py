@@ -20,8 +20,8 @@ class UNet(Encoder):
     Max-pooling leads to the next lower level. Bilinear interpolation and a 3×3 convolution lead to the next upper
     level, without the checkerboard patterns of transposed convolutions.
 
-    An input of 1 in every channel is empty ground, and so is everything beyond the border: sides are padded with empty
-    ground to a multiple of 2 ** (levels - 1) pixels.
+    An input of 1 in every channel is empty background, and so is everything beyond the border: sides are padded with
+    empty background to a multiple of 2 ** (levels - 1) pixels.
 
     Args:
         input_shape: (channels, height, width); the network also reads images of other heights and widths.
@@ -103,6 +103,6 @@ class UNet(Encoder):
 
 
 def double_size(maps: Float[Tensor, "batch channels height width"]) -> Tensor:
-    """Return the maps at twice the size by bilinear interpolation; beyond the border lies the empty ground."""
+    """Return the maps at twice the size by bilinear interpolation; beyond the border lies empty background."""
     wide = functional.pad(maps, (1, 1, 1, 1))
     return functional.interpolate(wide, scale_factor=2.0, mode="bilinear")[..., 2:-2, 2:-2]
