@@ -63,10 +63,10 @@ def address(named: str | None, folder: Path) -> Address:
 
 
 def confirm_address(recorded: str, named: str | None, folder: Path, source: Path) -> Address:
-    """Return the user's address of the store whose address `recorded` a file contains for the run in `folder`.
+    """Return the address, given by the user or the default one, of the store that a file names for a run.
 
     Args:
-        recorded: Address in the file.
+        recorded: Address of the store in the file.
         named: `logger.uri` of this command.
         folder: Folder of the run.
         source: Path of the file, for the message.
@@ -87,7 +87,10 @@ def confirm_address(recorded: str, named: str | None, folder: Path, source: Path
 
 
 def default_uri(folder: Path) -> str:
-    """Return the address of the default store: mlflow.db in the enclosing folder `outputs`, or else beside `folder`."""
+    """Return the address of the default store, the file mlflow.db.
+
+    It lies in the folder `outputs` that contains `folder`; without such a folder, it lies beside `folder`.
+    """
     return sqlite_uri(_outputs(folder) / "mlflow.db")
 
 

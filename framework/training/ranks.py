@@ -90,10 +90,10 @@ class _Sum(torch.autograd.Function):
 class WholeBatch(TorchFunctionMode):
     """Torch mode in which each rank draws random numbers for the whole batch and uses those of its own rows.
 
-    All ranks use the same seed, so each row gets the random numbers that it would get in one process. Of
-    the dimensions of a tensor, the first one that is as long as the rank's number of rows is assumed to be the batch.
-    Random numbers of a shape without such a dimension are the same on all ranks. Batch norm computes its training
-    statistics over the rows of all ranks.
+    All ranks use the same seed, so each row gets the random numbers that it would get in one process. Of the dimensions
+    of a tensor, the first one that is as long as the rank's number of rows is assumed to be the batch. Random numbers
+    of a shape without such a dimension are the same on all ranks. Batch norm computes its training statistics over the
+    rows of all ranks.
     """
 
     def __init__(self, rows: Share) -> None:

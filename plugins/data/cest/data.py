@@ -61,10 +61,11 @@ class Slice(NamedTuple):
 class CEST(Data, Mapped):
     """Z-spectra of a volume's voxels; the target is the Lorentzian lines fitted by least squares (thesis §4.1).
 
-    The volume is divided into bands of `band` neighbouring rows (the first axis). Consecutive bands are for training,
-    training, validation, training, training and test. If two neighbouring bands are in different splits, the first row
-    of the second band is left out, so that no voxel has a neighbour in another split. Fits are stored in the cache.
-    Batches also hold "place", (batch, 3), the index of the voxel, and "lines", (batch, p), all fitted parameters.
+    The volume is divided into bands of `band` neighbouring rows (the first axis). Of every six consecutive bands,
+    the third is for validation, the sixth for the test, and the others are for training. If two neighbouring bands are
+    in different splits, the first row of the second band is left out, so that no voxel has a neighbour in another
+    split. Fits are stored in the cache. Batches also hold "place", (batch, 3), the index of the voxel, and "lines",
+    (batch, p), all fitted parameters.
 
     Args:
         root: A volume in a format of volumes.py, or a folder with brain.npz; None to generate a slice.

@@ -63,7 +63,7 @@ class Volume(NamedTuple):
 
 
 def read_volume(file: Path) -> Volume:
-    """Read the spectra of one file, divided by M0 if the file holds M0.
+    """Read the spectra of one file, divided by M0, the unsaturated signal, if the file holds it.
 
     Raises:
         DataError: The file is missing, damaged, of another layout, or holds no voxel.
@@ -168,9 +168,10 @@ def _volume(arrays: Mapping[str, Any], size: int) -> Volume:
 
 
 def _divide_by_m0(spectra: np.ndarray, offsets: np.ndarray, m0: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the saturated spectra divided by M0, and their offsets; voxels whose M0 is 0 become NaN.
+    """Return the saturated spectra divided by M0, the unsaturated signal, and their offsets.
 
-    Without `m0`, M0 is the mean of the unsaturated images; without such images the spectra are already divided.
+    If `m0` is None, M0 is the mean of the unsaturated images; without such images the spectra are already divided.
+    Voxels whose M0 is 0 become NaN.
     """
     far = np.abs(offsets) >= UNSATURATED
     if far.all():

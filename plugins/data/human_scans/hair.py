@@ -38,7 +38,7 @@ class Hair(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """Separate mesh beside the body: metres, corners counter-clockwise seen from outside, linear RGB."""
+    """Separate mesh beside the body, metres; triangles are counter-clockwise seen from outside, colours linear RGB."""
 
     vertices: Float[np.ndarray, "vertices 3"]
     faces: np.ndarray

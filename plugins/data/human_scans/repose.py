@@ -174,9 +174,9 @@ def shape_change(text: str, count: int) -> Float[Tensor, "shape"]:
 
 
 def around(vertices: Float[Tensor, "vertex 3"], views: int, size: tuple[int, int]) -> dict[str, Camera]:
-    """Return `views` cameras by number, each of which sees all vertices.
+    """Return `views` cameras by name, "000", "001" and so on; each of them sees all vertices.
 
-    They lie at equal angles around the vertical axis; the first one is in front.
+    The cameras lie at equal angles around the vertical axis; the first one is in front.
     """
     cameras = {}
     for view in range(views):

@@ -37,7 +37,8 @@ class ChallengeResult(NamedTuple):
     """Result of one challenge.
 
     Attributes:
-        file: a zip of one text file for each pair: x, y, z, metres, on the second scan for each vertex of the first.
+        file: a zip with one text file for each pair, which holds for each vertex of the first scan the position x, y, z
+            on the second scan, metres.
         pairs: number of pairs.
         error_cm: mean error over the vertices, centimetres, of each pair whose true registrations exist.
     """

@@ -23,7 +23,8 @@ class Scanner:
 
     Attributes:
         points: total number of points of the surface and of other objects; fewer if parts are missing.
-        noise: largest standard deviation of every coordinate, metres; that of a scan is drawn uniformly below it.
+        noise: largest standard deviation of the noise on every coordinate, metres; the standard deviation of a scan is
+            drawn uniformly below this value.
         cut: largest share of the points that is missing behind a plane or within a ball.
         strangers: largest share of the points that do not belong to the body.
     """

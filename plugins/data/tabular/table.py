@@ -153,7 +153,7 @@ def load(
         writing: Notation of the file; None for the default.
         small_angles: Whether angles in degrees may all lie within ±2π.
         words: Treatment of columns of words.
-        arrange: Function that changes cells and settings after the table is read, such as the column `split`.
+        arrange: Function that changes cells and settings after the table is read, for example adds a column `split`.
 
     Raises:
         DataError: The file, a column, a cell, a label or a split has a fault; the message names line and column.

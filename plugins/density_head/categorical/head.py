@@ -29,9 +29,9 @@ class CategoricalHead(DensityHead):
 
 
 class BernoulliHead(DensityHead):
-    """Head of two classes: the logistic function of one logit is a probability; the loss is binary cross-entropy.
+    """Head of two classes: the probability of the second class is the logistic function of one logit.
 
-    Source: thesis eq. 2.9-2.11.
+    The loss is the binary cross-entropy (thesis eq. 2.9-2.11).
     """
 
     bibtex = "cox1958regression"

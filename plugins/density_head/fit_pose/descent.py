@@ -34,8 +34,9 @@ class Stage(NamedTuple):
     Attributes:
         part: the images of the stage have 1/part of the height and the width of the original image.
         blur: standard deviation of the blur, in pixels of the reduced image.
-        pull: weight of the prior, which is the sum of the squared parameters in units of their standard deviations. It
-            is added to the sum of squared differences, scaled to the number of pixels of the original image.
+        pull: weight of the prior, which is the sum of the squared parameters in units of their standard deviations. The
+            weighted prior is added to the sum of the squared differences of the images, and this sum of differences is
+            scaled to the number of pixels of the original image.
     """
 
     part: int

@@ -157,9 +157,9 @@ def encode(
 def encode_distances(clouds: Tensor, basis: Basis) -> Float[Tensor, "batch k"] | None:
     """Return the feature "distance" of clouds that are normalised to the unit ball, to the bit as `encode` does.
 
-    It returns None, and `encode` must be called, for clouds with padding, attributes, a gradient or bad numbers, of
-    another type than float32 or on another device than the CPU. For one cloud of 2,048 points, the checks and tensors
-    that it leaves out take half as long as the search itself.
+    For clouds with padding, attributes, a gradient or numbers that are not finite, and for clouds that are not float32
+    or not on the CPU, the function returns None; the caller then uses `encode`. For one cloud of 2,048 points, the
+    checks and tensors that this function leaves out take half as long as the search itself.
     """
     if (
         clouds.device.type != "cpu"

@@ -34,9 +34,10 @@ def disc(radius: int) -> np.ndarray:
 
 @cache
 def weights(radius: int) -> np.ndarray:
-    """Return the table of a point's weight, indexed by the squared distances of the point and of the nearest point.
+    """Return a table of the weights of points in the mean that a pixel shows.
 
-    Squared distances are in squared pixels, 0 to radius · (radius + 1).
+    The table is indexed by the squared distance of the point from the pixel and by that of the nearest point. The
+    distances are in pixels; squared, they are 0 to radius · (radius + 1).
     """
     square = np.arange(radius * (radius + 1) + 1)
     width = LEAST_WIDTH + SHARE * np.sqrt(square)
