@@ -1,0 +1,255 @@
+"""Compare the Pareto front of a search with NSGA-II with the fronts of grids of the same number of trials.
+
+    python -m benchmarks.framework.search [--folder FOLDER] [--runs NUMBER]
+
+The searches and the grids are commands of the framework, and their sweeps are in the folder, by default
+outputs/benchmarks/search. A sweep that is there already is continued, not repeated; so the script can be run in parts
+of `--runs` sweeps. When all sweeps have ended, the script writes search.md beside this file. The table is that of the
+UCI set concrete (REAL_DATA_ROOT/uci/concrete.csv).
+"""
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from benchmarks.commands import carry_out
+from benchmarks.pages import machine, write_page
+from framework.evaluation.pareto import TIME_NOISE, front
+
+TRIALS, SEEDS = 24, 3
+QUIET = ("logger=none", "pictures=false", "threads=1", "hydra.launcher.jobs=2")
+WIDTHS = ("[16]", "[64]", "[256]", "[1024]", "[16,16]", "[64,64]", "[256,256]", "[1024,1024]")
+RATES = ("1e-3", "5e-3", "2.5e-2")
+SPACE = (
+    f"encoder.mlp.widths={','.join(WIDTHS)}",
+    "optimizer.learning_rate=tag(log,interval(1e-3,2.5e-2))",
+    "encoder.mlp.dropout=interval(0.0,0.5)",
+)
+KEYS = tuple(override.partition("=")[0] for override in SPACE)
+GRIDS = {
+    "grid of 8 × 3 × 1": (SPACE[0], f"optimizer.learning_rate={','.join(RATES)}", "encoder.mlp.dropout=0.0"),
+    "grid of 4 × 3 × 2": (
+        f"encoder.mlp.widths={','.join(WIDTHS[::2])}",
+        f"optimizer.learning_rate={','.join(RATES)}",
+        "encoder.mlp.dropout=0.0,0.25",
+    ),
+}
+"""Overrides of each grid: number of widths × learning rates × dropout rates."""
+Points = list[tuple[float, float]]
+"""Validation loss in nats and milliseconds per sample of each trial."""
+
+
+def data() -> dict[str, tuple[str, ...]]:
+    """Return the overrides that both searches and grids have, by the name of the data set."""
+    table = Path(os.environ.get("REAL_DATA_ROOT", "")) / "uci" / "concrete.csv"
+    if not table.is_file():
+        sys.exit(f"{table} is missing. Set REAL_DATA_ROOT to the folder that has uci/concrete.csv.")
+    columns = table.read_text(encoding="utf-8").splitlines()[0].split(",")[:-2]
+    return {
+        "moons": (
+            *("experiment=moons/vanilla_128", "metric=[nll]", "~outliers"),
+            *("trainer.max_epochs=20", "trainer.check_val_every_n_epoch=5"),
+        ),
+        "concrete": (
+            *("data=tabular", f"data.path={table}", "data.target=strength", "data.kind=real"),
+            *(f"data.columns=[{','.join(columns)}]", "encoder=[mlp]", "density_head=gaussian"),
+            *("metric=[rmse]", "trainer.max_epochs=30"),
+        ),
+    }
+
+
+def commands(folder: Path) -> dict[tuple[str, str], tuple[Path, list[str]]]:
+    """Return folder and arguments of each sweep, by data set and name of the sweep."""
+    sweeps = {}
+    for name, overrides in data().items():
+        for seed in range(SEEDS):
+            place = folder / name / f"nsga2_{seed}"
+            search = ("hydra/sweeper=optuna", "hydra.sweeper.sampler=nsga2", f"hydra.sweeper.trials={TRIALS}")
+            arguments = [*search, f"hydra.sweeper.seed={seed}", *overrides, *SPACE]
+            sweeps[name, f"NSGA-II, seed {seed}"] = place, arguments
+        for number, (grid, space) in enumerate(GRIDS.items()):
+            sweeps[name, grid] = folder / name / f"grid_{number}", [*overrides, *space]
+    return sweeps
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One trial of a search or a grid: its validation loss in nats, its milliseconds per sample, and its settings."""
+
+    loss: float
+    milliseconds: float
+    settings: Mapping[str, str]
+
+
+def trials_of(folder: Path) -> list[Trial]:
+    """Return the trials of a sweep that have completed."""
+    trials = []
+    for path in folder.glob("*/value.json"):
+        results = json.loads(path.with_name("results.json").read_text(encoding="utf-8"))
+        overrides = json.loads(path.with_name("job.json").read_text(encoding="utf-8"))["overrides"]
+        settings = dict(override.split("=", 1) for override in overrides if "=" in override)
+        varied = {key.rpartition(".")[2]: settings[key] for key in KEYS}
+        trials.append(Trial(float(json.loads(path.read_text())), results["milliseconds_per_sample"], varied))
+    return trials
+
+
+def points(runs: Mapping[str, list[Trial]]) -> dict[str, Points]:
+    """Return the points of each run, with the median run time of all trials whose networks have the same widths.
+
+    Learning rate and dropout rate do not change the time of a prediction, and a single measurement is less exact than
+    the difference that counts (`TIME_NOISE`).
+    """
+    times: dict[str, list[float]] = {}
+    for trials in runs.values():
+        for trial in trials:
+            times.setdefault(trial.settings["widths"], []).append(trial.milliseconds)
+    return {
+        run: [(trial.loss, median(times[trial.settings["widths"]])) for trial in trials]
+        for run, trials in runs.items()
+    }
+
+
+def front_of(trials: Points) -> Points:
+    """Return the points of the Pareto front."""
+    marks = front([error for error, _ in trials], [time for _, time in trials], TIME_NOISE)
+    return [point for point, on_front in zip(trials, marks, strict=True) if on_front]
+
+
+def beaten(some: Points, others: Points) -> int:
+    """Return how many of some points another point beats: better in one quantity, not worse in the other."""
+    return sum(
+        any(
+            (error <= own_error and time * (1 + TIME_NOISE) < own_time)
+            or (error < own_error and time <= own_time * (1 + TIME_NOISE))
+            for error, time in others
+        )
+        for own_error, own_time in some
+    )
+
+
+def area(trials: Points, corner: tuple[float, float]) -> float:
+    """Return the area, in nats times the logarithm of the run time, that a set of points dominates below a corner."""
+    total, lowest = 0.0, corner[0]
+    for error, time in sorted(trials, key=lambda point: point[1]):
+        if error < lowest and time < corner[1]:
+            total += (lowest - error) * np.log(corner[1] / time)
+            lowest = error
+    return total
+
+
+def section(name: str, runs: Mapping[str, list[Trial]]) -> list[str]:
+    """Return the lines of a data set's section."""
+    results = points(runs)
+    everything = [point for trials in results.values() for point in trials]
+    corner = (max(error for error, _ in everything), max(time for _, time in everything))
+    best = area(everything, corner)
+    grids = {grid: results[grid] for grid in GRIDS}
+    fronts = {run: front_of(trials) for run, trials in results.items()}
+    lines = [
+        f"## {name}",
+        "",
+        "| run | trials | lowest loss, nats | its settings | on the front | "
+        + " | ".join(f"beaten by the {grid}" for grid in grids) + " | dominated area |",
+        "|---|---:|---:|---|---:|" + "---:|" * len(grids) + "---:|",
+    ]  # fmt: skip
+    for run, trials in results.items():
+        own = fronts[run]
+        counts = [
+            f"{beaten(own, others)} of {len(own)}" if run != grid else "" for grid, others in grids.items()
+        ]
+        lowest = min(runs[run], key=lambda trial: trial.loss)
+        settings = ", ".join(f"{key}={value}" for key, value in lowest.settings.items())
+        cells = [
+            run,
+            len(trials),
+            f"{lowest.loss:.3f}",
+            settings,
+            len(own),
+            *counts,
+            f"{area(trials, corner) / best:.3f}",
+        ]
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    searches = [run for run in results if run not in grids]
+    dominated = sum(
+        beaten(fronts[run], others) == len(fronts[run]) for run in searches for others in grids.values()
+    )
+    against = [
+        f"{sum(beaten(fronts[grid], results[run]) for run in searches) / len(searches):.1f} of {len(fronts[grid])}"
+        for grid in grids
+    ]
+    return [
+        *lines,
+        "",
+        f"A grid dominates a front if it beats every point of it. This happened in {dominated} of "
+        f"{len(searches) * len(grids)} comparisons. In the other direction, a search beats on average "
+        + " and ".join(f"{count} points on the front of the {grid}" for count, grid in zip(against, grids, strict=True))
+        + ".",
+        "",
+    ]  # fmt: skip
+
+
+def main() -> None:
+    """Run the sweeps that have not ended, and write the page when all have."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--folder", type=Path, default=Path("outputs/benchmarks/search"))
+    parser.add_argument("--runs", type=int, help="number of sweeps to run now; none: all")
+    arguments = parser.parse_args()
+    sweeps = commands(arguments.folder.absolute())
+    missing = {key: sweep for key, sweep in sweeps.items() if len(trials_of(sweep[0])) < TRIALS}
+    for _, (place, overrides) in list(missing.items())[: arguments.runs]:
+        carry_out([sys.executable, "-m", "framework", "-m", f"hydra.sweep.dir={place}", *QUIET, *overrides])
+    left = len(missing) - len(list(missing)[: arguments.runs])
+    if left:
+        sys.stdout.write(f"{left} sweeps are missing; run the script again.\n")
+        return
+    lines = [section(name, {run: trials_of(place) for (of, run), (place, _) in sweeps.items() if of == name})
+             for name in data()]  # fmt: skip
+    write_page(__file__, [*introduction(), *(line for part in lines for line in part), *ending()])
+
+
+def introduction() -> Sequence[str]:
+    """Return the first lines of the page."""
+    return [
+        "# Search for a Pareto front, compared with grids",
+        "",
+        "Does a search with NSGA-II (`hydra/sweeper=optuna hydra.sweeper.sampler=nsga2`) over error and run time find "
+        f"a front that no grid of the same number of trials dominates? Each run has {TRIALS} trials of a small "
+        "network. They differ in the widths of its layers, the learning rate and the dropout rate. The searches choose "
+        f"them from `{' '.join(SPACE)}`. The grids have {len(WIDTHS)} or {len(WIDTHS[::2])} widths, {len(RATES)} "
+        "learning rates and one or two dropout rates (0; 0 and 0.25).",
+        "",
+        "The error is the best validation loss. The run time is the number of milliseconds per sample on one "
+        "thread. It is the median over all trials of the table whose networks have the same widths, because a "
+        "single measurement, while another trial runs, differs by more than 5 %. A point beats another if it is "
+        f"better in one of the two and not worse in the other; run times within {100 * TIME_NOISE:g} % count as "
+        "equal, and losses are compared exactly. The dominated area is the area below the worst point, in nats "
+        "times the logarithm of the run time, divided by that of all trials together; higher is better.",
+        "",
+        "A grid contains the ends of the intervals, which a search hardly ever draws. A grid therefore has an "
+        "advantage where the best settings are at an end, as a learning rate of 0.025 and a dropout rate of 0 are "
+        "on moons.",
+        "",
+    ]
+
+
+def ending() -> Sequence[str]:
+    """Return the last lines of the page."""
+    return [
+        "moons is synthetic. concrete is the UCI set of 1,030 real measurements of the strength of concrete.",
+        "",
+        f"{machine('torch', 'pytorch-lightning', 'hydra-core', 'optuna')} "
+        "Command: `python -m benchmarks.framework.search`.",
+    ]
+
+
+if __name__ == "__main__":
+    main()
