@@ -100,16 +100,22 @@ def trials_of(folder: Path) -> list[Trial]:
     return trials
 
 
+def run_times(runs: Mapping[str, list[Trial]]) -> dict[str, list[float]]:
+    """Return all measured milliseconds per sample by the widths of the network."""
+    times: dict[str, list[float]] = {}
+    for trials in runs.values():
+        for trial in trials:
+            times.setdefault(trial.settings["widths"], []).append(trial.milliseconds)
+    return times
+
+
 def points(runs: Mapping[str, list[Trial]]) -> dict[str, Points]:
     """Return the points of each run, with the median run time of all trials whose networks have the same widths.
 
     Learning rate and dropout rate do not change the time of a prediction, and a single measurement is less exact than
     the difference that counts (`TIME_NOISE`).
     """
-    times: dict[str, list[float]] = {}
-    for trials in runs.values():
-        for trial in trials:
-            times.setdefault(trial.settings["widths"], []).append(trial.milliseconds)
+    times = run_times(runs)
     return {
         run: [(trial.loss, median(times[trial.settings["widths"]])) for trial in trials]
         for run, trials in runs.items()
@@ -191,6 +197,10 @@ def section(name: str, runs: Mapping[str, list[Trial]]) -> list[str]:
         f"{len(searches) * len(grids)} comparisons. In the other direction, a search beats on average "
         + " and ".join(f"{count} points on the front of the {grid}" for count, grid in zip(against, grids, strict=True))
         + ".",
+        "",
+        "The standard deviation of single measurements of the run time of the same network is "
+        f"{100 * median(np.std(times, ddof=1) / np.mean(times) for times in run_times(runs).values()):.0f} % (median over "
+        "the widths).",
         "",
     ]  # fmt: skip
 
