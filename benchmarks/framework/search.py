@@ -190,6 +190,7 @@ def section(name: str, runs: Mapping[str, list[Trial]]) -> list[str]:
         f"{sum(beaten(fronts[grid], results[run]) for run in searches) / len(searches):.1f} of {len(fronts[grid])}"
         for grid in grids
     ]
+    spreads = [float(np.std(times, ddof=1) / np.mean(times)) for times in run_times(runs).values()]
     return [
         *lines,
         "",
@@ -199,7 +200,7 @@ def section(name: str, runs: Mapping[str, list[Trial]]) -> list[str]:
         + ".",
         "",
         "The standard deviation of single measurements of the run time of the same network is "
-        f"{100 * median(np.std(times, ddof=1) / np.mean(times) for times in run_times(runs).values()):.0f} % (median over "
+        f"{100 * median(spreads):.0f} % (median over "
         "the widths).",
         "",
     ]  # fmt: skip
