@@ -61,8 +61,9 @@ class Preprocessing(NamedTuple):
 
     Attributes:
         module: module from a user's arrays, (batch, *input_shape) float64, to the model's inputs.
-        location, scale: mean and standard deviation of a typical array, both of the shape `input_shape`; `mode=export`
-            compares the exported model with the original one on arrays around them.
+        location: mean of a typical array, of the shape `input_shape`; `mode=export` compares the exported model with
+            the original one on arrays around it.
+        scale: standard deviation of a typical array, of the shape `input_shape`.
     """
 
     module: nn.Module

@@ -44,7 +44,7 @@ class Metric(torchmetrics.Metric, ABC):
     columns: ClassVar[dict[str, str]]
     """Keys of `compute` that belong in the result table, with their headings, in order: {"maad_deg": "MAAD °"}.
 
-    A key "<name>_sem" is printed behind "<name>" as ± and has no heading of its own.
+    A key `<name>_sem` is printed behind `<name>` as ± and has no heading of its own.
     """
 
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {}

@@ -50,12 +50,14 @@ class Interval(NamedTuple):
     """Central interval of each number of a density; every field has the shape (*batch, number) and is float64.
 
     Attributes:
-        low, high: the ends of the interval. Half of the remaining probability lies beyond each end. Angles are in
+        low: the lower end of the interval. Half of the remaining probability lies beyond each end. Angles are in
             radians: `low` is in [-π, π), and the interval is the arc from `low` counter-clockwise to `high`, at most
             one turn further. If the angle covers the whole circle, the circular median splits this arc into two parts
             of equal probability.
-        low_error, high_error: standard errors of the ends, in their unit; 0 where the ends were computed without draws,
-            infinite where fewer than 5 draws are expected beyond an end.
+        high: the upper end of the interval.
+        low_error: standard error of the lower end, in its unit; 0 where the end was computed without draws, infinite
+            where fewer than 5 draws are expected beyond it.
+        high_error: standard error of the upper end, as `low_error`.
     """
 
     low: Tensor

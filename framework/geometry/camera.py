@@ -28,7 +28,8 @@ class Camera:
         focal: (fx, fy), pixels, > 0; a tensor if its gradient is wanted.
         principal: (cx, cy), pixels; the centre of an image is ((width - 1) / 2, (height - 1) / 2). A tensor if its
             gradient is wanted.
-        height, width: image size, pixels.
+        height: height of the image, pixels.
+        width: width of the image, pixels.
         near: smallest depth that is seen, metres, > 0.
     """
 
