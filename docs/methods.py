@@ -7,11 +7,13 @@ The line is the first of the class's docstring, as in `python -m framework mode=
 
 import sys
 import tomllib
+from functools import cache
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from typing import NamedTuple
 
 from framework.configuration.registry import GROUPS
-from framework.modes.plugins import describe, paper
+from framework.modes.plugins import Description, describe, paper
 
 ROOT = Path(__file__).resolve().parent.parent
 HEADINGS = {
@@ -32,24 +34,68 @@ writes this page.
 """
 
 
-def page() -> str:
-    """Return the text of methods.md."""
+class EntryPage(NamedTuple):
+    """Entry point with the name of its page.
+
+    Attributes:
+        group: Registry of the plugin.
+        name: Name of the plugin.
+        value: Module and class, as in pyproject.toml.
+    """
+
+    group: str
+    name: str
+    value: str
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the plugin, relative to the project's folder."""
+        return Path(*self.value.partition(":")[0].split(".")[:3])
+
+    @property
+    def page(self) -> str:
+        """Path of the page on the site."""
+        return f"methods/{self.group}/{self.name}.md"
+
+    @property
+    def description(self) -> Description:
+        """Summary and BibTeX of the class, read without importing it."""
+        return describe(
+            self.group, EntryPoint(name=self.name, value=self.value, group=f"framework.{self.group}")
+        )
+
+
+@cache
+def entries() -> tuple[EntryPage, ...]:
+    """Return all entry points of the project, by registry and name."""
     with (ROOT / "pyproject.toml").open("rb") as file:
-        entry_points = tomllib.load(file)["project"]["entry-points"]
-    parts = [INTRODUCTION]
+        groups = tomllib.load(file)["project"]["entry-points"]
+    return tuple(
+        EntryPage(group, name, groups[f"framework.{group}"][name])
+        for group in GROUPS
+        for name in sorted(groups[f"framework.{group}"])
+    )
+
+
+def page(*, of_site: bool = False) -> str:
+    """Return the text of methods.md; on the site, each name leads to the page of its entry point."""
+    parts = [
+        INTRODUCTION.replace("the README of the plugin's folder", "the page of the plugin")
+        if of_site
+        else INTRODUCTION
+    ]
     for group in GROUPS:
-        names = entry_points[f"framework.{group}"]
-        rows = [row(group, name, names[name]) for name in sorted(names)]
+        rows = [row(entry, of_site=of_site) for entry in entries() if entry.group == group]
         table = "\n".join(["| name | what it is | source |", "|---|---|---|", *rows])
         parts.append(f"## {HEADINGS[group]} (`{group}`)\n\n{table}\n")
     return "\n".join(parts)
 
 
-def row(group: str, name: str, value: str) -> str:
+def row(entry: EntryPage, *, of_site: bool) -> str:
     """Return the line of one entry point."""
-    description = describe(group, EntryPoint(name=name, value=value, group=f"framework.{group}"))
-    folder = Path(*value.partition(":")[0].split(".")[:3])
-    cells = (f"[`{name}`](../{folder.as_posix()}/README.md)", description.summary, paper(description.bibtex))
+    description = entry.description
+    link = entry.page if of_site else f"../{entry.folder.as_posix()}/README.md"
+    cells = (f"[`{entry.name}`]({link})", description.summary, paper(description.bibtex))
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 

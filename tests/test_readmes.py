@@ -1,5 +1,5 @@
-"""Commands in all READMEs and in the page of claims, which must compose with settings that their plugins accept;
-files are not read."""
+"""Commands in all READMEs, the pages of docs/ and the page of claims, which must compose with settings that their
+plugins accept; files are not read."""
 
 import re
 import shlex
@@ -23,14 +23,14 @@ CLAIMS = ROOT / "reproduction" / "claims.md"
 READMES = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
-    ROOT / "docs/commands.md",
+    *sorted(ROOT.glob("docs/**/*.md")),
     CLAIMS,
     *sorted(ROOT.glob("plugins/*/*/README.md")),
 ]
 FOLDERS = cache(composition.config_folders)
 """Found once for all commands."""
 MODULES = ("benchmarks.", "reproduction.")
-NOT_OURS = ("=mine", "=theirs", "X=", "resume=", "--")
+NOT_OURS = ("=mine", "=[mine]", "=my_laplace", "=theirs", "X=", "resume=", "--")
 """Parts of commands that stand for a reader's own plugin, take their config from a run folder, or compose nothing."""
 
 
@@ -54,9 +54,13 @@ def jobs(command: str) -> list[str]:
     """Return the arguments without the flag of a sweep, with only the first value of each swept key."""
     words = shlex.split(command.replace("checkpoint=last", "checkpoint=X"))  # there may be no run here
     arguments, swept = [word for word in words if word not in ("-m", "...", "…")], "-m" in words
-    first = re.compile(r"^([^=]+=)([^\[{'\"(]*?),.*$")
+    first = re.compile(r"^([^=]+=)(\[[^\]]*\]|[^\[{'\"(]*?),.*$")
     arguments = [first.sub(r"\1\2", word) if swept else word for word in arguments]
-    return [word for word in arguments if not word.startswith("hydra") and "=tag(" not in word]
+    return [
+        word
+        for word in arguments
+        if not word.startswith("hydra") and not re.search(r"=(tag|range|interval)\(", word)
+    ]
 
 
 @pytest.mark.parametrize("readme, command", ALL, ids=[f"{one.parent.name}: {said[:60]}" for one, said in ALL])

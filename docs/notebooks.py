@@ -1,0 +1,137 @@
+"""Tutorials as notebooks: run them, and write what they print into their pages.
+
+    python docs/notebooks.py docs/tutorials/table.md
+
+A tutorial is a Markdown file. Its blocks of `bash` and `python` are the cells of a notebook, which jupytext reads. The
+command runs the cells in an empty folder and writes their outputs behind them, between two comments: text as a block,
+figures as PNG files beside the page. Without a file, the command runs all tutorials. The site offers each tutorial as a
+notebook without outputs.
+"""
+
+import base64
+import datetime
+import os
+import re
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+FOLDER = Path(__file__).resolve().parent / "tutorials"
+BEGIN, END = "<!-- output -->", "<!-- end of output -->"
+HEADER = "---\njupyter:\n  kernelspec: {name: python3, display_name: Python 3, language: python}\n---\n\n"
+"""Beginning of a notebook in Markdown; without it jupytext takes the most frequent language, often bash."""
+WITHOUT_COLOURS = (
+    "import os\nfor name in ('FORCE_COLOR', 'CLICOLOR_FORCE', 'CLICOLOR'):\n    os.environ.pop(name, None)"
+)
+"""First cell of a run: ipykernel sets variables that make commands write colours and progress bars."""
+LIMIT = 300
+"""Longest time of a cell, s."""
+MOST_LINES = 40
+"""Largest number of lines of an output that a page shows; the lines in the middle are left out."""
+
+
+def without_outputs(text: str) -> str:
+    """Return a tutorial without its outputs."""
+    return re.sub(rf"(?s)\n*{BEGIN}.*?{END}\n*", "\n\n", text)
+
+
+def notebook(text: str) -> str:
+    """Return a tutorial as a notebook without outputs, JSON of nbformat 4."""
+    import jupytext
+
+    book = jupytext.reads(HEADER + without_outputs(text), fmt="md")
+    for number, cell in enumerate(book.cells):
+        cell["id"] = f"cell-{number}"
+    return jupytext.writes(book, fmt="ipynb")
+
+
+def run(text: str, folder: Path) -> Any:
+    """Return a tutorial as a notebook whose cells have run in a folder.
+
+    Raises:
+        nbclient.exceptions.CellExecutionError: A cell failed.
+        nbclient.exceptions.CellTimeoutError: A cell took longer than five minutes.
+    """
+    import nbformat
+    from nbclient import NotebookClient
+
+    os.environ |= {"COLUMNS": "100", "NO_COLOR": "1", "MLFLOW_DISABLE_TELEMETRY": "true"}
+    os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    book = nbformat.reads(notebook(text), as_version=4)
+    book.cells.insert(0, nbformat.v4.new_code_cell(WITHOUT_COLOURS))
+    NotebookClient(
+        book, timeout=LIMIT, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
+    ).execute()
+    del book.cells[0]
+    return book
+
+
+def with_outputs(text: str, book: Any, name: str, seconds: float, folder: str) -> str:
+    """Return a tutorial with the outputs of its cells, and write their figures beside the tutorials.
+
+    Args:
+        text: Tutorial, with or without outputs.
+        book: The same tutorial as a notebook that has run.
+        name: Name of the tutorial, with which the names of figures begin.
+        seconds: Run time of the notebook, which the last line of the page says.
+        folder: Folder in which the notebook has run; outputs show the paths below it.
+    """
+    for old in FOLDER.glob(f"{name}_*.png"):
+        old.unlink()
+    cells = iter([cell for cell in book.cells if cell.cell_type == "code"])
+    figures = 0
+
+    def shown(match: re.Match[str]) -> str:
+        nonlocal figures
+        parts, printed = [], ""
+        for output in next(cells).outputs:
+            data = output.get("data", {})
+            if "image/png" in data:
+                figures += 1
+                file = FOLDER / f"{name}_{figures}.png"
+                file.write_bytes(base64.b64decode(data["image/png"]))
+                parts.append(f"![Output of the cell above]({file.name})")
+            elif output.output_type == "stream" and output.name == "stdout":
+                printed += output.text
+            elif "text/plain" in data:
+                printed += data["text/plain"] + "\n"
+        if printed.strip():
+            parts.insert(0, f"```text\n{shortened(printed.replace(f'{folder}/', ''))}\n```")
+        return "\n\n".join([match[0], BEGIN, *parts, END]) if parts else match[0]
+
+    text = re.sub(r"\n*<!-- run -->.*\Z", "\n", without_outputs(text), flags=re.S)
+    text = re.sub(r"(?ms)^```(?:bash|python)\n.*?^```$", shown, text).rstrip()
+    today = datetime.datetime.now(datetime.UTC).date()
+    cores = len(os.sched_getaffinity(0))
+    return (
+        f"{text}\n\n<!-- run -->\n*The outputs on this page are those of a run on {cores} cores on {today}, which took "
+        f"{seconds:.0f} s.*\n"
+    )
+
+
+def shortened(output: str) -> str:
+    """Return an output without trailing blanks, and without the middle of a long output."""
+    lines = [line.rpartition("\r")[2].rstrip() for line in output.strip("\n").split("\n")]
+    if len(lines) > MOST_LINES:
+        half = MOST_LINES // 2
+        lines = [*lines[:half], f"[… {len(lines) - 2 * half} lines …]", *lines[-half:]]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run the tutorials that the command names, and write their outputs."""
+    paths = [Path(argument) for argument in sys.argv[1:]] or sorted(FOLDER.glob("[!i]*.md"))
+    for path in paths:
+        text = path.read_text(encoding="utf-8")
+        with tempfile.TemporaryDirectory() as folder:
+            start = time.perf_counter()
+            book = run(text, Path(folder))
+            seconds = time.perf_counter() - start
+        path.write_text(with_outputs(text, book, path.stem, seconds, folder), encoding="utf-8")
+        sys.stdout.write(f"{path}: {seconds:.0f} s\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,138 @@
+"""Tests of the documentation site: its links, its pages of plugins and its tutorials.
+
+test_readmes.py composes the commands of the pages, and test_documentation.py tests that links lead to files.
+"""
+
+import importlib
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import yaml
+from markdown.extensions.toc import slugify
+
+from framework.configuration.registry import load
+from tests.test_documentation import DOCUMENTS
+
+ROOT = Path(__file__).parent.parent
+TUTORIALS = sorted(path for path in (ROOT / "docs/tutorials").glob("*.md") if path.stem != "index")
+FOREIGN = re.compile(
+    r"<(?:script|img|iframe|source)\b[^>]*\bsrc=[\"']?(?:https?:)?//[^>]*>"
+    r"|<link\b[^>]*\brel=[\"']?(?:stylesheet|preconnect|preload)\b[^>]*\bhref=[\"']?(?:https?:)?//[^>]*>"
+    r"|@import[^;]*//[^;]*;|url\([\"']?(?:https?:)?//[^)]*\)"
+)
+"""Pattern of the elements that a browser would load from another server."""
+
+
+@pytest.fixture(scope="module")
+def site() -> ModuleType:
+    """Return the module of the site's hooks."""
+    sys.path.insert(0, str(ROOT / "docs"))
+    try:
+        return importlib.import_module("site_pages")
+    finally:
+        sys.path.remove(str(ROOT / "docs"))
+
+
+def anchors(document: Path) -> set[str]:
+    """Return the anchors of the headings of a Markdown file, as MkDocs names them."""
+    text = re.sub(r"(?ms)^```.*?^```$", "", document.read_text(encoding="utf-8"))
+    titles = re.findall(r"(?m)^#+ (.+)$", text)
+    return {slugify(re.sub(r"\[([^\]]*)\]\([^)]*\)|[`*]", r"\1", title), "-") for title in titles}
+
+
+def test_links_to_headings_lead_to_headings() -> None:
+    broken = []
+    for document in DOCUMENTS:
+        for path, anchor in re.findall(
+            r"\]\(((?!https?:)[^)#\s]*)#([^)\s]+)\)", document.read_text(encoding="utf-8")
+        ):
+            target = (document.parent / path) if path else document
+            if "." not in anchor and anchor not in anchors(target):  # names of Python objects have dots
+                broken.append(f"{document.relative_to(ROOT)}: {path}#{anchor}")
+    assert not broken
+
+
+def test_the_navigation_names_pages_that_exist_and_all_pages_of_the_docs(site: ModuleType) -> None:
+    text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    nav = yaml.safe_load(text)["nav"]
+    targets = {
+        *site.pages().values(),
+        "reference/settings.md",
+        "reference/experiments.md",
+        "reference/metrics.md",
+    }
+    assert set(site.leaves(nav)) <= targets
+    assert not list(site.unlisted(nav)), "add these pages to `nav` in mkdocs.yml"
+
+
+def test_every_setting_of_every_plugin_has_a_meaning_on_its_page(site: ModuleType) -> None:
+    pages, tables = sys.modules["method_pages"], sys.modules["setting_tables"]
+    unclear = [
+        f"{entry.group} {entry.name}: {row.key}"
+        for entry in site.entries()
+        for row in pages.settings_of(entry, load(entry.group, entry.name))
+        if not row.meaning or row.values.startswith(("<", "typing."))
+    ]
+    assert not unclear, "\n".join(unclear)
+    rows = re.findall(r"(?m)^\| `([\w.]+)` \| (.+?) \| (.+) \| (.*) \|$", tables.settings_page())
+    assert len(rows) > 60
+    assert not [key for key, values, *_ in rows if values.startswith(("<", "typing."))]
+
+
+@pytest.mark.parametrize("tutorial", TUTORIALS, ids=lambda path: path.stem)
+def test_a_tutorial_is_a_notebook_and_shows_the_outputs_of_a_run(site: ModuleType, tutorial: Path) -> None:
+    text = tutorial.read_text(encoding="utf-8")
+    cells = [cell for cell in json.loads(site.notebook(text))["cells"] if cell["cell_type"] == "code"]
+    assert len(cells) == len(re.findall(r"(?m)^```(?:bash|python)$", text)) > 3
+    notebooks = sys.modules["notebooks"]
+    assert notebooks.BEGIN in text and "<!-- run -->" in text, f"run `python docs/notebooks.py {tutorial}`"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tutorial", TUTORIALS, ids=lambda path: path.stem)
+def test_a_tutorial_runs(tutorial: Path, tmp_path: Path) -> None:
+    code = (
+        "import sys, pathlib; sys.path.insert(0, sys.argv[1]); import notebooks; "
+        "notebooks.run(pathlib.Path(sys.argv[2]).read_text('utf-8'), pathlib.Path.cwd())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(ROOT / "docs"), str(tutorial)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_warnings_and_loads_nothing_from_elsewhere(
+    site: ModuleType, tmp_path: Path
+) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")],
+        cwd=ROOT, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0 and "WARNING" not in done.stderr, done.stderr
+    built = {
+        path.relative_to(tmp_path / "site").with_suffix(".md").as_posix() for path in tmp_path.rglob("*.html")
+    }
+    assert {entry.page for entry in site.entries()} <= built
+    foreign = {
+        (path.name, match[0])
+        for pattern in ("*.html", "*.css")
+        for path in tmp_path.rglob(pattern)
+        for match in FOREIGN.finditer(path.read_text(encoding="utf-8"))
+    }
+    assert not foreign
+    placeholders = re.compile(r"<(?:name|run|time|folder|file|id|key|group|registry|value)\b[^>]*>")
+    lost = {
+        (path.name, match[0])
+        for path in tmp_path.rglob("*.html")
+        for match in placeholders.finditer(path.read_text())
+    }
+    assert not lost, "a browser does not show these words: write them as code"
