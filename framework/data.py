@@ -204,15 +204,15 @@ class Data(ABC):
         return {"input": self.inputs(user_data)}
 
     def frame(self, batch: Batch) -> Frame | None:
-        """Return the frames of the samples of a batch, with which predictions are mapped to the user's unit.
+        """Return the affine map (`Frame`) that converts targets and predictions of a batch to the user's unit.
 
-        A data set of real targets overrides this if each target is given in a frame of its own input, such as a
+        A data set of real targets overrides this if each target is given relative to its own input, such as a
         normalised cloud. The default, None, means that targets are in the user's unit.
         """
         return None
 
     def preprocessing(self) -> Preprocessing | None:
-        """Return what `inputs` computes from an array, for `mode=export`; works without `prepare`.
+        """Return the computation of `inputs` on an array, for `mode=export`; works without `prepare`.
 
         A data set whose `inputs` changes the numbers of an array (standardises them, for example) overrides this. The
         default, None, means that arrays are the model's inputs as they are.

@@ -75,7 +75,7 @@ class FitsInputs(ABC):
         """Fit the encoder in place.
 
         Args:
-            inputs: what the encoder reads for each sample of the training split.
+            inputs: inputs of the encoder for all samples of the training split.
         """
 
 

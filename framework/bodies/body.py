@@ -355,7 +355,7 @@ class BodyModel(nn.Module):
 
 
 def _rows(values: np.ndarray) -> np.ndarray:
-    """Return an array of shape (vertex, 3, row), rearranged to (row, 3 · vertex)."""
+    """Rearrange an array of shape (vertex, 3, row) to (row, 3 · vertex)."""
     return np.moveaxis(values, 0, 2).transpose(1, 0, 2).reshape(values.shape[2], -1)
 
 

@@ -36,7 +36,9 @@ def decimate(
     uv_faces: Int[np.ndarray, "faces 3"],
     count: int,
 ) -> Decimated:
-    """Collapse edges until `count` vertices are left; of edges with equal error, the lowest vertex number goes first.
+    """Collapse edges, in the order of increasing error, until `count` vertices are left.
+
+    If several edges have equal errors, the one with the lowest vertex number is collapsed first.
 
     Seams of the texture stay seams: a vertex on a seam moves along it or not at all.
 
@@ -110,9 +112,9 @@ class _Collapses:
         return {corner for face in self.around[v] for corner in self.corners[face] or ()} - {v}
 
     def _places_after(self, v: int, u: int) -> dict[int, int] | None:
-        """Return the texture coordinate of vertex u that replaces each one of vertex v if v collapses onto u.
+        """Map each texture coordinate of vertex v to the one of vertex u that replaces it if v collapses onto u.
 
-        The keys are the texture coordinates of v. None means that the collapse would break a seam of the texture.
+        The result is None if the collapse would break a seam of the texture.
         """
         place_after: dict[int, int] = {}
         for face in self.around[v] & self.around[u]:

@@ -91,7 +91,7 @@ class Traits:
 def interpolation(
     values: Float[Tensor, "person"], anchors: Float[Tensor, "anchor"]
 ) -> Float[Tensor, "person anchor"]:
-    """Return the weights of linear interpolation: the mean of the anchors with these weights is the value.
+    """Return the weights of linear interpolation: the sum of weight · anchor over the anchors is the value.
 
     Only the two anchors around a value have weights above 0, and the sum of the weights is 1. Values outside of the
     range of the anchors are clamped to it. The anchors ascend.

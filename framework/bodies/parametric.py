@@ -140,7 +140,10 @@ class ParametricBody:
             setattr(self, name, torch.from_numpy(np.ascontiguousarray(values)))
 
     def camera(self, height: int, width: int) -> Camera:
-        """Return a camera in front of the body with parameters 0, 1.2 body heights away; it sees the whole body."""
+        """Return a camera that sees the whole body if all its parameters are 0.
+
+        The camera is in front of the body, at a distance of 1.2 times the height of the body.
+        """
         low, high = float(self.template[1].min()), float(self.template[1].max())
         return Camera(
             rotation=torch.tensor([1.0, -1.0, -1.0]).diag(),

@@ -155,7 +155,7 @@ def skeleton(body: Body) -> Skeleton:
 def draw(count: int, random: Generator) -> Float[np.ndarray, "pose movement"]:
     """Return movements of random poses, degrees, in the order of MOVEMENTS.
 
-    If the movements of the left side equal those of the right side, the pose is symmetric.
+    A movement has the same sign for the left and the right side, so equal values give a symmetric pose.
     """
     wide = np.where(random.random(count) < TAIL, WIDER, 1.0)
     left_arm = _choice(ARMS, count, random)

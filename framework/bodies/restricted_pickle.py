@@ -214,7 +214,7 @@ def _refuse(why: str) -> NoReturn:
 
 
 class _Plain:
-    """Conversion of records to arrays.
+    """Converter of the records (`_Record`) of a pickle to arrays.
 
     An object that is referenced twice is converted once, so that nesting cannot multiply it.
 
@@ -359,7 +359,7 @@ def _side(value: Any) -> bool:
 
 
 def _line(values: Any, kinds: str) -> np.ndarray:
-    """Return `values` if they are a one-dimensional array of one of the kinds of dtype in `kinds`.
+    """Return `values` unchanged if they are a one-dimensional array whose kind of dtype is in `kinds`.
 
     Raises:
         PickleRefused: `values` is anything else.

@@ -145,7 +145,7 @@ def topology(body: Body, surface: Sheet, name: Name) -> Topology:
 def recognise_topology(
     body: Body, vertices: int, faces: Int[np.ndarray, "faces 3"], source: str
 ) -> tuple[Sheet, Topology]:
-    """Return the topology of the body that has as many vertices and the same triangles as a mesh, and its sheet.
+    """Return the sheet and the topology of the body that fit a mesh: as many vertices, and the same triangles.
 
     Raises:
         DataError: no topology of the body has this number of vertices, or the triangles differ.
@@ -198,9 +198,9 @@ def split(
 ) -> Split:
     """Split edges in the middle: all edges, or those where `chosen` is true.
 
-    `chosen` is in the order of the function `edges`. The numbers of new vertices start at `vertices`, the number of
-    existing ones; those of new texture coordinates start at `places`. With `numbered_as_all`, edges that are not split
-    also take a number, which stays unused.
+    `chosen` is in the order of the function `edges`. New vertices are numbered from `vertices`, the number of
+    existing vertices, and new texture coordinates from `places`, the number of existing texture coordinates. With
+    `numbered_as_all`, edges that are not split also take a number, which stays unused.
     """
     pairs, sides = edges(corners.faces)
     uv_pairs, uv_sides = edges(corners.uv_faces)

@@ -26,7 +26,7 @@ class Unposed(NamedTuple):
 
     Attributes:
         offsets: displacements in the rest pose, metres.
-        folded: true for each vertex whose blended matrix (`unpose`) has a singular value below SMALLEST.
+        folded: true for each vertex whose matrix A (see `unpose`) has a singular value below SMALLEST.
     """
 
     offsets: Float[Tensor, "batch vertex 3"]
@@ -54,7 +54,7 @@ def unpose(
     position, which makes almost no difference in this pose. The offsets are continuous and bounded.
 
     Raises:
-        ValueError: other shapes, or numbers that are not finite.
+        ValueError: an argument has a wrong shape, or a number that is not finite.
     """
     residuals = vertices - model(shape, pose, translation)
     if not residuals.isfinite().all():

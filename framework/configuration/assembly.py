@@ -36,8 +36,8 @@ class Assembly:
         parts: Resolved configs of all plugins.
         data: Data set, whose `prepare` has not been called yet.
         target: Target that the data set knows before it is prepared; None if it knows no target yet.
-        head: Density head for `target`. It is None without a target, and if building a head draws random numbers: its
-            initial weights are then a function of the seed, so that `build_predictor` must build it.
+        head: Density head for `target`. None without a target, and if building the head draws random numbers.
+            `build_predictor` then builds the head, so that its initial weights are a function of the seed.
         metrics: Metrics for `target`, without any state; None without a target.
     """
 
@@ -158,8 +158,8 @@ def build_predictor(
 ) -> Predictor:
     """Return the untrained predictor, whose initial weights are a function of `seed` and the config.
 
-    The encoders before the first one that is not `Encoder.fixed` are shared by all models and placed outside the
-    uncertainty wrappers.
+    The chain of encoders may begin with fixed ones (`Encoder.fixed`). All models share these, and they are placed
+    outside the uncertainty wrappers.
 
     Args:
         resolved: Resolved configs of all plugins.

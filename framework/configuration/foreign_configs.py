@@ -61,7 +61,7 @@ def require_harmless(arguments: Sequence[str], groups: Collection[str]) -> None:
 
 
 def _group(file: Path, folder: Path) -> str:
-    """Return the name of the topmost folder below `folder` that contains a file; "" for a file in `folder` itself."""
+    """Return the name of the subfolder of `folder` in which `file` lies at any depth; "" if it lies in none."""
     return (*file.relative_to(folder).parts[:-1], "")[0]
 
 

@@ -329,7 +329,10 @@ def fill(predictor: Predictor, state: Mapping[str, torch.Tensor], name: str) -> 
 
 
 def require_match(mismatch: str | None, name: str) -> None:
-    """Raise a CheckpointError if there is a mismatch between weights and the model of the checkpoint `name`."""
+    """Raise a CheckpointError if weights do not fit the model of the checkpoint `name`.
+
+    `mismatch` is a sentence that says what does not fit; None if the weights fit.
+    """
     if mismatch:
         raise CheckpointError(
             f"{name} belongs to another model: {mismatch} Use the config of its training, or give another checkpoint."

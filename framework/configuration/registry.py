@@ -51,18 +51,18 @@ def unusable_names(group: str) -> dict[str, str]:
 
 @cache
 def package_name(package: Any) -> str | None:
-    """Return the name of an installed package (an `Entry.dist`), which Python parses again for each access."""
+    """Return the name of an installed package (an `Entry.dist`), cached, because Python parses it at each access."""
     return package.name
 
 
 @cache
 def _entry_points() -> Any:
-    """Return the entry points of all installed packages, which takes as long as those of one group."""
+    """Return the entry points of all installed packages; to read a single group would take as long."""
     return entry_points()
 
 
 def _entries(group: str) -> dict[str, list[Entry]]:
-    """Return the entry points of a group by name, sorted; if two have the same name and object, one of them."""
+    """Return the entry points of a group by name, sorted; only one of those with the same name and object is kept."""
     entries_by_name: dict[str, list[Entry]] = {}
     for entry in sorted(_entry_points().select(group=f"framework.{group}"), key=lambda entry: entry.name):
         same_name = entries_by_name.setdefault(entry.name, [])
@@ -143,7 +143,7 @@ def _describe_missing_module(entry: Entry, module: str) -> str:
 
 
 def _remedy(entry: Entry, module: str) -> str:
-    """Return how to install a missing module: with the plugin package's extra that requires it, or by its name."""
+    """Return advice on installing a missing module: by the extra of the plugin's package, or by the module's name."""
     package = module.partition(".")[0].lower()
     for requirement in (entry.dist.requires if entry.dist else None) or ():
         required = re.match(r"[\w.-]+", requirement)
@@ -170,7 +170,7 @@ def config_folders() -> dict[str, Path]:
     """Return the config folder of every installed plugin that ships configs, by the name of the plugin.
 
     Raises:
-        ConfigError: A plugin ships a config of Hydra itself.
+        ConfigError: A plugin ships a config that would configure Hydra itself.
     """
     folders: dict[str, Path] = {}
     for entry in sorted(_entry_points().select(group="framework.conf"), key=lambda entry: entry.name):

@@ -9,7 +9,7 @@ from framework.datasets.csv_columns import ENOUGH_ROWS
 
 
 def unlike_degrees(values: Float[np.ndarray, "rows"]) -> str:
-    """Return why values that are stated to be degrees look like radians; "" if they do not."""
+    """Return the reason why values that are stated to be degrees look like radians; "" if they do not."""
     magnitudes = np.abs(values[np.isfinite(values)])
     largest = magnitudes.max(initial=0.0)
     if len(magnitudes) > ENOUGH_ROWS and 0 < largest <= 2 * math.pi:
@@ -21,7 +21,7 @@ def unlike_degrees(values: Float[np.ndarray, "rows"]) -> str:
 
 
 def unlike_radians(values: Float[np.ndarray, "rows"]) -> str:
-    """Return why values that are stated to be radians look like degrees; "" if they do not."""
+    """Return the reason why values that are stated to be radians look like degrees; "" if they do not."""
     magnitudes = np.abs(values[np.isfinite(values)])
     beyond = magnitudes > 2 * math.pi
     if len(magnitudes) > ENOUGH_ROWS and 2 * beyond.sum() > len(magnitudes):

@@ -55,7 +55,7 @@ def to_inputs(data: Data, images: Any) -> Tensor:
 
 
 def _whole(image: Image.Image, shape: tuple[int, ...]) -> UInt8[Tensor, "channels side side"]:
-    """Return an image as an input of this shape; border pixels are repeated to make it square."""
+    """Return an image as an input of shape `shape`; border pixels are repeated to make the image square."""
     try:
         decoded = decode(image, shape[0], upright=True)
     except DataError as error:

@@ -206,7 +206,7 @@ def decode_opaque(image: Image.Image) -> Iterator[tuple[int, UInt8[np.ndarray, "
     """Decode an image to RGB as `decode` does, but ignore its alpha: transparent pixels keep their colours.
 
     Yields:
-        The first row of a strip, and its pixels.
+        The index of the first row of each strip of the image, and the pixels of the strip.
 
     Raises:
         DataError: as in `decode`.

@@ -38,7 +38,7 @@ MOST_SAMPLES, MOST_SHARDS = 10**12, 10**6
 
 
 def part_name(number: int) -> str:
-    """Return the name of the file of part `number`, counted from 0."""
+    """Return the name of the file of shard `number`, counted from 0."""
     return f"part-{number:06}.npy"
 
 
@@ -87,7 +87,7 @@ class Shards:
             return torch.from_numpy(array)
 
     def batches(self, number: int, batch_size: int) -> Iterator[Tensor]:
-        """Yield the inputs of shard `number` in batches, clouds without padding that the whole batch has."""
+        """Yield the inputs of shard `number` in batches; padding rows that all clouds of a batch have are removed."""
         for batch in self.read(number).split(batch_size):
             yield trim(batch)
 

@@ -154,5 +154,5 @@ def _on_grid(density: Distribution, points: int) -> tuple[Tensor, Tensor]:
 
 
 def _largest_of_last(moments: Complex[Tensor, "harmonic *batch"]) -> Float[Tensor, "*batch"]:
-    """Return the largest |m_n| in the highest twentieth of the orders n."""
+    """Return the largest absolute value of the moments whose orders are in the highest twentieth."""
     return moments[-max(2, len(moments) // 20) :].abs().amax(0)

@@ -15,7 +15,7 @@ LARGEST_DEFECT = 0.01
 
 
 def class_probabilities(density: Distribution) -> Float64[Tensor, "batch class"]:
-    """Return p(y = k) of each sample, in [0, 1]; each row sums to 1 in float64.
+    """Return p(y = k) for each sample and class k, in [0, 1]; the sum over the classes is 1 in float64.
 
     The probabilities are exp of log_prob at each class, in float64, divided by their sum. Before this division, the
     sums differ from 1: by 1e-7 for a float32 log_prob, by 1e-3 if its logits reach 1e4, and by a random amount if

@@ -389,9 +389,9 @@ def _(density: Mixture, index: Tensor) -> Distribution:
 
 @protocol.pick.register
 def _(density: Reshaped, index: Tensor) -> Distribution:
-    """Return the density at `index`; items that are not chosen are not drawn from if this can be avoided.
+    """Return the density at `index`; where possible, no samples are drawn from items that are not chosen.
 
-    It can be avoided if the batch of the wrapped density has one dimension and this density is no mixture.
+    This is possible if the wrapped density has one batch dimension and is no mixture.
     """
     inner = density.density
     # a picked mixture draws from all its items for each pick; here these would be the items of the whole batch

@@ -61,8 +61,8 @@ def _step_to_top(pull: Tensor, stiffness: Tensor, angles: bool) -> Tensor:
     The step is 0 where it is not finite.
 
     Args:
-        pull: field of the bound.
-        stiffness: field of the bound.
+        pull: gradient of the bound at that point (`QuadraticBound.pull`).
+        stiffness: curvature of the bound (`QuadraticBound.stiffness`).
         angles: true if the numbers are angles.
     """
     return (torch.atan2(pull, stiffness) if angles else pull / stiffness).nan_to_num(0.0, 0.0, 0.0)

@@ -75,7 +75,10 @@ def _heights(
     width: Tensor,
     circle: bool,
 ) -> Tensor | None:
-    """Return the interpolated density at each mode, up to one factor, for the item `index` of the batch."""
+    """Return the interpolated density of the mixture at each mode, up to a common factor.
+
+    `index` is the item of the batch. The result is None if the density cannot be interpolated.
+    """
     if not bool((width.isfinite() & (width > 0) & place.isfinite()).all()):
         return None
     unit = 2 * math.pi if circle else 1.0
@@ -112,9 +115,9 @@ def _heights(
 
 
 class _Grid:
-    """Sums at the nodes of all levels.
+    """Grid of nodes for each level; a node holds the weighted sum of the densities of the level's components.
 
-    Only blocks of 2**BLOCK consecutive nodes have memory in which a component has nodes.
+    Consecutive nodes form blocks of 2**BLOCK nodes. A block has memory only if a component has nodes in it.
     """
 
     def __init__(self, keys: Tensor, circle: bool) -> None:
@@ -125,7 +128,7 @@ class _Grid:
 
     @classmethod
     def around(cls, level: Tensor, node: Tensor, circle: bool) -> "_Grid":
-        """Return an empty grid with memory for the nodes within REACH of each of these nodes."""
+        """Return an empty grid with memory for all nodes whose number differs by at most REACH from one in `node`."""
         steps = torch.tensor([[-REACH], [0], [REACH]], device=node.device)
         keys = cls.key(level, node + steps, circle).unique()
         if circle:
@@ -144,7 +147,7 @@ class _Grid:
         return (level << 40) + (number >> BLOCK)
 
     def slot(self, level: Tensor, number: Tensor) -> Tensor:
-        """Return the positions of nodes in `sums`."""
+        """Return the indices in `sums` of the nodes `number` of a level."""
         key = self.key(level, number, self.circle)
         rank = torch.searchsorted(self.keys, key)
         known = self.keys[rank.clamp(max=len(self.keys) - 1)] == key
@@ -152,7 +155,10 @@ class _Grid:
         return (rank << BLOCK) + (number & ((1 << BLOCK) - 1))
 
     def add(self, level: Tensor, number: Tensor, terms: Tensor) -> None:
-        """Add terms at the nodes `number`, (step, component); the numbers of a component are consecutive."""
+        """Add terms, (step, component), to the sums at the nodes `number`.
+
+        The nodes of a component have consecutive numbers.
+        """
         # at most three blocks are searched for each component, not the block of every node
         first = number[0] >> BLOCK
         blocks = (first + torch.arange(3, device=number.device).unsqueeze(-1)) << BLOCK
@@ -161,7 +167,10 @@ class _Grid:
         self.sums.index_add_(0, slots.flatten(), terms.flatten())
 
     def interpolate(self, level: Tensor, position: Tensor) -> Tensor:
-        """Return the sum of one level at positions, in units of the level's spacing, from six nodes (Lagrange)."""
+        """Return the sum of one level, interpolated at each position from six nodes (Lagrange).
+
+        Positions are in units of the distance between the nodes of the level.
+        """
         first = torch.floor(position)
         part = position - first
         total = torch.zeros_like(position)

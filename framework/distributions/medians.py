@@ -45,7 +45,7 @@ def median_of_real(density: Distribution) -> Float[Tensor, "*batch 1"] | None:
 
 
 def _widen(density: Distribution, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a bracket of the median, by doubling the distance from the given one."""
+    """Return a bracket that contains the median, by moving the ends outwards in steps of doubling length."""
     reach = protocol.peak_widths(density).amax(0).double().unsqueeze(-1) + (high - low)
     for _ in range(ROUNDS):
         below, above = protocol.cdf(density, low), protocol.cdf(density, high)

@@ -39,10 +39,11 @@ class Interval(NamedTuple):
 
 
 class Bound(NamedTuple):
-    """A log-density (*sample, *batch), its gradient, and the curvature of a lower bound that touches it there.
+    """A log-density at a value y, and a lower bound of the log-density that touches it at y.
 
-    Gradient and curvature have the shape (*sample, *batch, *event). For angles d, the bound is
-    gradient · sin d - curvature · (1 - cos d), otherwise gradient · d - curvature · d²/2.
+    `log_prob` has the shape (*sample, *batch); gradient and curvature have the shape (*sample, *batch, *event). At
+    y + d, the bound is `log_prob` + Σ (gradient · d - curvature · d²/2), or for angles
+    `log_prob` + Σ (gradient · sin d - curvature · (1 - cos d)).
     """
 
     log_prob: Array
@@ -128,10 +129,10 @@ class Density:
         return None
 
     def nodes(self) -> tuple[Array, Array]:
-        """Return points of a quadrature of one number and the probability at each, both (point, *batch).
+        """Return quadrature points of one number, and the probability that each represents, both (point, *batch).
 
-        The points are those of Gauss's rule between neighbouring distances from the peaks; these distances grow by
-        a constant factor.
+        The line is cut at each peak and at distances from it that grow by a constant factor. Gauss's rule gives the
+        points between two neighbouring cuts.
         """
         place, width = self.peaks()
         steps = np.concatenate(
@@ -171,7 +172,7 @@ class Density:
 
 
 def _quantile(density: Density, probability: float) -> Array:
-    """Return the quantile of one real number by bisection, (*batch)."""
+    """Return the quantile of one real number at `probability`, (*batch), by bisection."""
     place, width = density.peaks()
     low, high = (place - width).min(0), (place + width).max(0)
     reach = high - low
@@ -190,7 +191,7 @@ def _quantile(density: Density, probability: float) -> Array:
 
 
 def _bisect(below: Any, low: Array, high: Array) -> Array:
-    """Return the place between `low` and `high` at which `below` changes from true to false."""
+    """Return the number between `low` and `high` at which `below` changes from true to false."""
     for _ in range(STEPS):
         middle = low + (high - low) / 2
         left = below(middle)
@@ -201,7 +202,7 @@ def _bisect(below: Any, low: Array, high: Array) -> Array:
 
 
 def _central(density: Density, mass: float) -> tuple[Array, Array]:
-    """Return the ends of the central interval of one real number, (*batch)."""
+    """Return the ends of the central interval of probability `mass` of one real number, (*batch) each."""
     return _quantile(density, (1 - mass) / 2), _quantile(density, (1 + mass) / 2)
 
 
@@ -236,7 +237,7 @@ def _circular_median(density: Density) -> Array:
 
 
 def _arc(density: Density, mass: float) -> tuple[Array, Array]:
-    """Return the ends of the central arc of one angle, (*batch); `low` is in [-π, π)."""
+    """Return the ends of the central arc of probability `mass` of one angle, (*batch); `low` is in [-π, π)."""
     median = _circular_median(density)
     turn = np.full_like(median, math.pi)
     high = _bisect(lambda width: density.arc(median, median + width) < mass / 2, np.zeros_like(turn), turn)
@@ -578,7 +579,10 @@ def _as_many(parts: Sequence[Array]) -> list[Array]:
 
 
 class Affine(Density):
-    """The density of location + scale · Y, for numbers Y with the density `inner`; both (*batch, number)."""
+    """The density of location + scale · Y, for a vector Y with the density `inner`.
+
+    Location and scale have the shape (*batch, number).
+    """
 
     def __init__(self, location: Array, scale: Array, inner: Density) -> None:
         self.location, self.scale, self.inner = location, scale, inner

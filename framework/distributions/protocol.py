@@ -270,7 +270,7 @@ def ranked_score(density: Distribution, value: Tensor) -> Tensor | None:
     """Return the continuous ranked probability score of a density of one real number at `value` y (*batch, 1).
 
     The score E|X - y| - ½ E|X - X'| (Gneiting & Raftery 2007, eq. 21) is float64, (*batch), in the unit of the number.
-    Default: None, no formula is known. The metric then knows the scores of normals, and uses draws otherwise.
+    Default: None, no formula is known. The metric then uses its own formula or draws.
     """
     return None
 
@@ -298,7 +298,10 @@ def trigonometric_moments(density: Distribution, count: int, weights: Tensor | N
 
 
 def weighted_moments(moments: Tensor | None, weights: Tensor | None) -> Tensor | None:
-    """Return the sum of moments (count, *batch, K) over K with `weights` (*batch, K); unchanged if one is None."""
+    """Return the sum of moments (count, *batch, K) over K with `weights` (*batch, K).
+
+    If one of the arguments is None, `moments` is returned.
+    """
     return moments if moments is None or weights is None else (weights * moments).sum(-1)
 
 
@@ -308,11 +311,13 @@ def arc_length(start: Tensor, end: Tensor) -> Tensor:
 
 
 class Region(NamedTuple):
-    """Highest-density regions of each item, (*batch,), float64; such a region holds all values above some density.
+    """Probabilities and size of highest-density regions of each item, (*batch,), float64.
+
+    A highest-density region holds all values at which the density is above some level.
 
     Attributes:
-        low: probability of all values that are denser than a given value.
-        high: probability of all values that are at least as dense.
+        low: probability of all values at which the density is higher than at a given value.
+        high: probability of all values at which the density is at least as high as at the given value.
         size: size of the region with a given probability, in the unit of the target.
     """
 
@@ -325,11 +330,11 @@ class Region(NamedTuple):
 def highest_region(
     density: Distribution, value: Tensor, mass: float, equal: Mapping[torch.dtype, float]
 ) -> Region | None:
-    """Return the highest-density regions of one number; None if they are not known in closed form (the default).
+    """Return highest-density regions of one number; None if they are not known in closed form (the default).
 
     Args:
         density: a density of one number, with batch_shape (*batch).
-        value: (*batch, 1).
+        value: the given value of `Region`, (*batch, 1).
         mass: probability of the region whose size is returned, in (0, 1).
         equal: relative difference up to which two densities count as equal, so that rounding has no influence; by the
             dtype of the density, float32 or float64.

@@ -219,7 +219,10 @@ class CircularPower(Distribution):
             off = self._fill()
 
     def _fill(self) -> Float[Tensor, "*batch"]:
-        """Evaluate the power on the grid; return the uncertainty of log Z, nats, infinite where a peak is missed."""
+        """Evaluate the power p^(1/T) and its normaliser Z on the grid.
+
+        Return the error of log Z, nats; it is infinite where the grid misses a peak.
+        """
         self.angles, log_width = self._grid(self.points)
         log_prob = self.density.log_prob(self.angles)  # (points, *batch)
         self.top = log_prob[0]
@@ -286,7 +289,7 @@ class CircularPower(Distribution):
         return self.power_of(self.density.log_prob(value))
 
     def power_of(self, log_prob: Tensor) -> Tensor:
-        """Return the log-density of the power, given the log-density `log_prob` of p."""
+        """Return the log-density of the power p^(1/T) / Z, given the log-density `log_prob` of p."""
         # relative to the mode's log-density, so that large log-densities do not cancel
         return divide_by_temperature(log_prob - self.top, self.temperature) - self.log_normaliser
 
@@ -317,7 +320,7 @@ class CircularPower(Distribution):
     @cached_property
     @torch.no_grad()
     def _between(self) -> tuple[Float[Tensor, "item node"], Float[Tensor, "item node"]]:
-        """Ascending angles relative to the mode, from 0 to 2π, and the power there, 1 at the mode."""
+        """Ascending angles relative to the mode, from 0 to 2π, and p^(1/T) at these angles, scaled to 1 at the mode."""
         batch = self.batch_shape.numel()
         u = (
             2
@@ -350,7 +353,7 @@ class CircularPower(Distribution):
         return offset, height
 
     def entropy(self) -> Tensor:
-        """Return log Z minus the expectation of log p^(1/T), nats, by the trapezium rule."""
+        """Return the entropy of p^(1/T) / Z, nats: log Z minus the mean of log p^(1/T), by the trapezium rule."""
         # p log p → 0 as p → 0; the clamp keeps 0 · (-inf) from being NaN
         return self.log_normaliser - (self.mass * self.powers.clamp(min=-1e4)).sum(0)
 

@@ -122,8 +122,8 @@ class Difference:
     Attributes:
         value: the mean difference.
         standard_error: standard error of the mean difference; NaN for fewer than two pairs.
-        probability: two-sided probability of so large a difference between equal methods, by Student's t-test for
-            pairs; NaN for fewer than two pairs.
+        probability: two-sided p-value of Student's t-test for pairs, the probability of so large a difference if the
+            methods are equal; NaN for fewer than two pairs.
         pairs: number of pairs.
     """
 
@@ -134,9 +134,10 @@ class Difference:
 
 
 def paired_difference(first: Sequence[float], second: Sequence[float]) -> Difference:
-    """Return the mean of first - second over pairs, with its standard error and its probability.
+    """Return the mean of first - second over pairs, with its standard error and the p-value of a t-test.
 
-    If all differences are equal, the standard error is 0; the probability is then 0, or 1 if the differences are 0.
+    If all differences are equal, the standard error is 0. The p-value is then 1 if the differences are 0, and 0
+    otherwise.
     """
     from scipy.special import stdtr
 
@@ -152,10 +153,10 @@ def paired_difference(first: Sequence[float], second: Sequence[float]) -> Differ
 
 
 def holm(probabilities: Sequence[float]) -> list[float]:
-    """Return the probabilities of several tests, corrected for their number; NaN stays NaN and is not counted.
+    """Return the p-values of several tests, corrected for the number of tests; NaN stays NaN and is not counted.
 
-    A test is significant at 5 % if its corrected probability is at most 0.05. The probability that any test of equal
-    methods is significant is then at most 5 % (S. Holm (1979), "A simple sequentially rejective multiple test
+    A test is significant at 5 % if its corrected p-value is at most 0.05. The probability that at least one test of two
+    equal methods is significant is then at most 5 % (S. Holm (1979), "A simple sequentially rejective multiple test
     procedure", Scandinavian Journal of Statistics 6, 65-70).
     """
     order = sorted(

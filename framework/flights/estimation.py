@@ -24,12 +24,12 @@ MOST = torch.tensor([BELIEVED] * 3 + [50.0] * 3 + [1000.0] * 3, dtype=torch.floa
 
 
 class ObservedFrames(NamedTuple):
-    """Observed frames of flights.
+    """Times and positions at which a ball was observed in each frame of several flights.
 
     Attributes:
         times: (flight, frame), s, not decreasing. A missing frame has the time at which it should have been observed.
             All frames before the first observed one have the time of that one.
-        places: (flight, frame, 3), m, NaN if the frame is missing.
+        places: positions of the ball, (flight, frame, 3), m, NaN if the frame is missing.
     """
 
     times: Tensor
@@ -42,7 +42,7 @@ class ObservedFrames(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """State at the first frame, its covariance, and half the sum of squared residuals at the end of the search."""
+    """State of each flight at the first frame, its covariance, and half the final sum of squared residuals."""
 
     state: Float[Tensor, "flight 9"]
     covariance: Float[Tensor, "flight 9 9"]
@@ -63,7 +63,7 @@ class Prior(NamedTuple):
 
 
 def observed_frames(frames: Float[Tensor, "flight frame 5"], step: float) -> ObservedFrames:
-    """Return the observed frames in double precision.
+    """Return the times and positions of the observed frames, in double precision.
 
     Args:
         frames: numbers that a model reads (framework.flights.frames.PARTS).

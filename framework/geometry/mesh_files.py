@@ -66,7 +66,7 @@ def text_lines(content: bytes, comment: bytes | None = b"#", names: Sequence[byt
         content: bytes of the file.
         comment: sign at which a comment begins, unless it stands within a number such as 1.#INF; None if there are no
             comments.
-        names: lines with one of these first words are kept whole, because a name follows, which may contain the sign.
+        names: lines with one of these first words are kept whole, because the name after it may contain `comment`.
 
     Raises:
         ValueError: the text is UTF-16.

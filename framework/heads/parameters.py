@@ -45,7 +45,7 @@ def require_validation(raw: Tensor, fitted: str) -> None:
 
     Args:
         raw: raw parameters of the validation split, (sample, size).
-        fitted: what is fitted, with its verb: "A fixed covariance is".
+        fitted: subject and verb of the message, such as "A fixed covariance is".
 
     Raises:
         ValueError: the split is empty.

@@ -31,12 +31,10 @@ class BodyFit:
 
 
 class PosedBodyDensity(Independent):
-    """Independent normal densities of the parameters of a parametric body, as they were fitted to images.
-
-    The mean is where each fit ended.
+    """Independent normal densities of the parameters of a parametric body, which were fitted to images.
 
     Args:
-        mean, scale: (*batch, parameter).
+        mean, scale: parameters at the end of each fit, and their standard deviations, (*batch, parameter).
         fits: fit of each image, in the order of the flattened batch; None if the input was no image of a body.
         body_model, renderer, camera: body that the parameters describe, and how it is rendered.
     """

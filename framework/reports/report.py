@@ -75,7 +75,10 @@ def report_test(run: Run, session: Session) -> None:
 
 
 def _logged_names(run: Run) -> set[str]:
-    """Return the names of numbers that a resumed run has logged already and need not log again; else the empty set."""
+    """Return the names of the numbers that a resumed run has logged already and need not log again.
+
+    The set is empty for a run that is not resumed.
+    """
     return {name for line in run.tracker.journal.lines() for name in line.values} if run.resumed else set()
 
 

@@ -156,7 +156,7 @@ def _tracker(config: Config, run_id: str | None, resumed: bool) -> Tracker:
 
 
 def _method(config: Config) -> str | None:
-    """Return the name of the density head, which names a training without an experiment; None in other modes."""
+    """Return the name of the density head, by which a training without an experiment is named; None in other modes."""
     head = config.settings.density_head if config.mode == "train" else None
     return str(head.get("name")) if isinstance(head, Mapping) else None
 

@@ -131,7 +131,7 @@ def nearest(
 def quick_distances(clouds: np.ndarray, queries: Queries) -> np.ndarray | None:
     """Return the distances that `nearest` finds on the CPU, without its checks; None if `nearest` must be called.
 
-    It is called for clouds with a number that is NaN or infinite, and for coordinates of extreme magnitude.
+    `nearest` must be called if a coordinate is NaN, infinite or of extreme magnitude.
 
     Args:
         clouds: (batch, points, 3), contiguous, at least one cloud of at least one point, of the dtype of the queries.

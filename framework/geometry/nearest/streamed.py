@@ -82,7 +82,7 @@ class Stream:
 
         Args:
             distance: distance of the nearest point in the new chunk.
-            points: this point.
+            points: coordinates of this nearest point.
         """
         assert self.best is not None
         nearer = distance < self.best.distance

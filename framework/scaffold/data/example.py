@@ -81,7 +81,7 @@ class Example(Data):
         return batch
 
     def fingerprint(self) -> Mapping[str, str]:
-        """Return what identifies the data."""
+        """Return entries that identify the data: name, number of samples, noise and seed."""
         return {
             "name": "example 1",
             "samples": str(self.samples),

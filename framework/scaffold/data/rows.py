@@ -1,4 +1,4 @@
-"""Contract rows: parameters with which `mode=check` tests the plugin, and what it must say about them."""
+"""Contract rows: parameters with which `mode=check` tests the plugin, and the results that it expects."""
 
 from collections.abc import Sequence
 from pathlib import Path
