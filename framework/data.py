@@ -160,8 +160,8 @@ class Data(ABC):
     def splits(self) -> Splits:
         """Return the three splits.
 
-        Items are dicts of tensors without a batch dimension. A dataset that fetches many items at once faster also has
-        `__getitems__(indices) -> Batch`, which returns them as a batch (framework.datasets.fields).
+        Items are dicts of tensors without a batch dimension. A dataset that can fetch many items at once
+        also has `__getitems__(indices) -> Batch`, which returns them as a batch (framework.datasets.fields).
         """
 
     @abstractmethod
@@ -242,7 +242,7 @@ class Data(ABC):
 
     @abstractmethod
     def augment(self, batch: Batch) -> Batch:
-        """Return a training batch with random variations, on the batch's device, or the batch itself.
+        """Return a training batch with random variations, on the batch's device; without variations, the batch itself.
 
         Random numbers come from torch's global generator. The framework seeds it by (seed, step) before the call, so
         that a resumed run sees the same variations. A variation that changes the target (a mirror) changes "target"
@@ -259,7 +259,7 @@ class Data(ABC):
 
 
 class Mapped(ABC):
-    """Additional base class of a data set whose samples are positions in one file, so that predictions form maps.
+    """Additional base class of a data set in which one file gives many samples, whose predictions form maps.
 
     An example is a data set whose samples are the voxels of a volume.
     """

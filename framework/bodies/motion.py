@@ -48,9 +48,9 @@ class Motion(NamedTuple):
     """Content of a BVH file.
 
     Attributes:
-        names, parents: names and parents of its joints; the root's parent is -1.
+        names, parents: name of each joint, and index of its parent joint; -1 for the root.
         offsets: position of each joint relative to its parent if no joint rotates, in the file's unit.
-        rotations: rotation of each joint relative to its parent.
+        rotations: rotation of each joint relative to its parent, in each frame.
         seconds: duration of a frame.
     """
 
@@ -121,7 +121,7 @@ def _hierarchy(
     """Return names, parents, offsets and channels of the joints, without the end sites of the last bones.
 
     Args:
-        words: words of the hierarchy, without the first.
+        words: words of the part of the file that begins with "HIERARCHY", without this word.
         text: content of the file, for messages.
     """
     names, parents, offsets, channels = [], [], [], []
@@ -235,7 +235,7 @@ def _roles(motion: Motion) -> dict[str, int]:
 
 
 def _places(motion: Motion) -> Float[np.ndarray, "joint 3"]:
-    """Return the positions of the joints if no joint rotates."""
+    """Return the positions that the joints have if no joint rotates."""
     positions = motion.offsets.copy()
     for joint, parent in enumerate(motion.parents):
         positions[joint] += positions[parent] if parent >= 0 else 0

@@ -20,7 +20,7 @@ from framework.geometry.camera import Camera
 
 
 class Turn(NamedTuple):
-    """Rotation that a movement causes: the joint (as a role of framework.bodies.poses.Skeleton), the axis and sign."""
+    """Rotation that a movement causes: joint (a field of framework.bodies.poses.Skeleton), axis and sign."""
 
     movement: str
     role: str

@@ -45,7 +45,7 @@ class MeshFit(NamedTuple):
 
 
 class _Problem(NamedTuple):
-    """Least-squares problem; its parameters are pose, translation and shape, in this order."""
+    """Least-squares problem of fitting a body to a mesh; its parameters are pose, translation and shape, in order."""
 
     model: BodyModel
     vertices: Float[Tensor, "vertex 3"]

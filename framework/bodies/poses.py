@@ -75,7 +75,7 @@ MOVEMENTS = (*CENTRAL, *(f"{side} {name}" for side in ("left", "right") for name
 class Skeleton:
     """Indices of the joints that each movement rotates; several joints share the rotation equally.
 
-    Pairs are (left, right).
+    A field with two joints holds (left, right).
     """
 
     root: int

@@ -72,7 +72,7 @@ class Sheet:
     def interpolate(self, values: np.ndarray, stages: int | None = None) -> np.ndarray:
         """Return values at the body's vertices, interpolated to the sheet's vertices after the first `stages` stages.
 
-        None means all stages.
+        If `stages` is None, all stages are used.
         """
         return _interpolate(values, self.pairs[:stages])
 
@@ -272,7 +272,7 @@ def _compact(rows: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray) -> Topol
 
 
 def _read_decimated(body: Body, corners: Corners, count: int) -> Decimated:
-    """Return the body decimated to `count` vertices, from the cache, because decimation takes some seconds."""
+    """Return the body decimated to `count` vertices; the cache keeps it, because decimation takes some seconds."""
     digest = hashlib.sha256(np.ascontiguousarray(body.template).tobytes())
     for part in corners:
         digest.update(np.ascontiguousarray(part).tobytes())

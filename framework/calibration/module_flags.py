@@ -16,7 +16,7 @@ BATCH_NORM = (
 def set_flag(
     model: nn.Module, kinds: type[nn.Module] | tuple[type[nn.Module], ...], flag: str, value: bool
 ) -> Iterator[None]:
-    """Set `flag`, for example "training", to `value` on the model's modules of these kinds inside the `with` block.
+    """Set `flag`, for example "training", to `value` on all modules of the classes `kinds` inside the `with` block.
 
     After the block, also after an error, each module has its own value again.
     """

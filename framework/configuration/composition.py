@@ -297,7 +297,7 @@ def _describe_unknown_key(cause: OmegaConfBaseException) -> str:
 
 
 def _dotted_keys(values: Any, before: str = "") -> list[str]:
-    """Return the dotted keys, each with the prefix `before`, of all entries of nested mappings, without Hydra's own."""
+    """Return the dotted keys of all entries of nested mappings, without Hydra's keys; each key begins with `before`."""
     keys = []
     for key, value in values.items() if isinstance(values, Mapping) else ():
         if before or key != "hydra":

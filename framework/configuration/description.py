@@ -59,7 +59,7 @@ class Description:
     def of(
         cls, parts: Resolved, data: Data, method: str, settings: Settings, remarks: tuple[str, ...] = ()
     ) -> "Description":
-        """Return the description of a model that consists of `parts`, for prepared `data`."""
+        """Return the description of a model that consists of `parts` and is trained on `data`, which are prepared."""
         inherited = {key: getattr(settings, key) for key in INHERITED}
         state = dict(data.state_dict())
         about = data.target, data.input_shape, data.columns, data.synthetic

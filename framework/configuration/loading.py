@@ -164,7 +164,7 @@ def reader(description: Description, chosen: Data | None = None) -> Data:
 
     Args:
         description: Description of the model.
-        chosen: Data set of the description's config, if it is built already.
+        chosen: This data set, if the caller has built it already; None: it is built here.
     """
     with translate_errors(
         Path(description.path), "a checkpoint of this framework", FOREIGN, kind=CheckpointError

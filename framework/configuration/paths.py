@@ -245,7 +245,7 @@ def parse_paths(options: Sequence[str]) -> dict[str, str]:
 
 
 def _parts(config: dict[str, Any], unused: Collection[str]) -> Iterator[_Part]:
-    """Yield every plugin in a config, including plugins inside plugins; those of the groups `unused` get no class."""
+    """Yield every plugin in a config, including plugins inside plugins; groups in `unused` are not imported."""
     for group in (*GROUPS, "outliers"):
         chosen = config.get(group)
         named: list[tuple[str, Any]] = []

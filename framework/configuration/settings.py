@@ -175,7 +175,7 @@ class Settings(_Strict):
     """Composed config of a command: the settings of the core, checked, and the chosen plugins.
 
     The constructors of the plugins check their parameters (`framework.configuration.assembly`), so that the config of a
-    plugin is any value here. A group from which several plugins may be chosen has a mapping from names to one each.
+    plugin is any value here. A group from which several plugins may be chosen has a mapping from names to plugins.
     """
 
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0

@@ -11,7 +11,7 @@ READING = tuple(name for name, mode in MODES.items() if mode.stored)
 
 
 def names_run(resume: object) -> bool:
-    """Return whether the value of the setting `resume`, typed or composed, is the folder of a run to continue."""
+    """Return whether the value of the setting `resume` is the folder of a run to continue."""
     return resume not in ("auto", "never", "null", "", None)
 
 

@@ -205,7 +205,7 @@ class ColumnChoice(NamedTuple):
     Attributes:
         names: names of the chosen columns.
         left_out: reason why each other column is left out, by name.
-        odd: remark about each chosen column that may not be meant as a number, by name.
+        odd: for each chosen column that may not be meant as numbers, a remark, by name.
     """
 
     names: tuple[str, ...]
@@ -214,7 +214,7 @@ class ColumnChoice(NamedTuple):
 
 
 def describe_choice(chosen: ColumnChoice) -> tuple[str, ...]:
-    """Return remarks about the columns left out and the odd ones, for the first lines of a run."""
+    """Return remarks for the first lines of a run: columns left out, and columns that may not be meant as numbers."""
     left_out = [f"{quote(name)} ({why})" for name, why in chosen.left_out.items()]
     listed = (
         [*left_out[:MOST_LISTED], f"and {len(left_out) - MOST_LISTED} more"]

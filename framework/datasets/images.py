@@ -142,9 +142,9 @@ def open_stream(stream: BinaryIO | BytesIO) -> Iterator[Image.Image]:
 
 
 class PixelLimit:
-    """Limit on the number of decoded pixels that all threads together keep in memory.
+    """Limit on the number of decoded pixels in memory, over all threads together.
 
-    A thread may exceed the limit if no other thread keeps pixels, so that every image can be decoded.
+    A thread may exceed the limit if no other thread has decoded pixels, so that every image can be decoded.
 
     Args:
         most: largest number of pixels.
@@ -488,10 +488,10 @@ def list_lines(items: Sequence[object]) -> str:
 
 
 def refuse_listed(wrong: Sequence[object], problem: str, remedy: str) -> None:
-    """Raise an error that counts and lists the wrong items, if there are any.
+    """Raise an error that counts and lists the items in `wrong`; do nothing if there are none.
 
     Raises:
-        DataError: there are wrong items.
+        DataError: `wrong` is not empty.
     """
     if wrong:
         raise DataError(f"{len(wrong)} {problem}:{list_lines(wrong)}\n{remedy}")

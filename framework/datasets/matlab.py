@@ -216,7 +216,7 @@ class _Reader:
         return np.array([letters[row::rows] for row in range(rows)])
 
     def fields(self, content: bytes, position: int, limit: int) -> tuple[list[str], int]:
-        """Return the field names of a struct, stored with padding to one length, and the position of its values."""
+        """Return the field names of a struct, without the padding to equal lengths, and the position of its values."""
         lengths, position = self.numbers(content, position, limit)
         _, start, end = self.element(content, position, limit)
         length = int(lengths[0]) if len(lengths) == 1 else 0

@@ -194,7 +194,7 @@ def _form(model: Exporting) -> Exported:
     """Return the parameters of the model's density for a batch of arrays.
 
     Raises:
-        ConfigError: the density cannot be exported, or is another one each time.
+        ConfigError: the density cannot be exported, or two calls give different densities.
     """
     arrays = model.arrays(BATCH, 1.0)
     batch = reader(model.description).user_batch(arrays.numpy())
@@ -316,7 +316,10 @@ def _compare(
 
 
 def _difference(computed: np.ndarray, expected: np.ndarray) -> float:
-    """Return the largest difference of two arrays as a share of the largest number in a row; infinite if NaN differ."""
+    """Return the largest difference of two arrays, relative to the largest number in its row.
+
+    The result is infinite if the shapes differ, or if only one of the arrays has NaN at some position.
+    """
     if computed.shape != expected.shape or (np.isnan(computed) != np.isnan(expected)).any():
         return float("inf")
     if not expected.size:

@@ -119,8 +119,8 @@ class Mixture(Distribution):
     def mode(self) -> Tensor:
         """Mode: for classes the most likely one, for one component its mode, otherwise a maximum found by `highest`.
 
-        With `many_components.FEWEST` or more components, the search starts only from the modes of components that
-        `likeliest_modes` finds, where it applies.
+        With `many_components.FEWEST` or more components over one number, the search starts only from the modes that
+        `likeliest_modes` returns, unless it returns None.
         """
         event = len(self.event_shape)
         if self.log_weights.shape[-1] == 1:

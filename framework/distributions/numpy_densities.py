@@ -376,7 +376,7 @@ class Normal(Density):
 
 
 class Uniform(Density):
-    """Independent angles, each uniform over the circle, of the shape of `location` (*batch, angle)."""
+    """Independent angles, each uniform over the circle; only the shape of `location`, (*batch, angle), is used."""
 
     circular = True
 

@@ -48,7 +48,7 @@ class Reference:
 
 
 def reference_value(log_probs: LogProbs, value: int, seeds: Sequence[int]) -> Reference:
-    """Return the log-likelihood at a large value of the knob, averaged over seeds.
+    """Return the log-likelihoods at a large value of the knob, averaged over seeds.
 
     The densities of the seeds are averaged, not their logarithms. If the knob counts Monte Carlo samples, this equals
     one estimate with len(seeds) times as many samples, and the bias of the logarithm (Jensen) shrinks accordingly. The
@@ -56,7 +56,7 @@ def reference_value(log_probs: LogProbs, value: int, seeds: Sequence[int]) -> Re
     11.5); R is the number of seeds, θ_(r) the mean log-likelihood without seed r, and θ_(·) the mean of all θ_(r).
 
     Args:
-        log_probs: log-likelihoods at a value and a seed.
+        log_probs: function of a value of the knob and a seed that returns the log-likelihood of each sample.
         value: the large value of the knob.
         seeds: at least two seeds.
 

@@ -37,7 +37,7 @@ class NormalisedClouds(NamedTuple):
         clouds: normalised clouds, of the input's dtype; attributes of the points and the padding are unchanged.
         centre: centre of each cloud, in the cloud's own units, float64, so that mapping back loses no digits of clouds
             that are far from the origin.
-        scale: factor of each cloud, float64; 1 for a cloud whose points are all at one position.
+        scale: factor from normalised to own coordinates of each cloud, float64; 1 if all points are at one position.
     """
 
     clouds: Float[Tensor, "batch points columns"]
@@ -137,9 +137,9 @@ def normalise_clouds(
         clouds: (batch, points, columns).
         how: "unit_ball": the mean of the points is subtracted, then the coordinates are divided by the largest norm
             (thesis eq. 6.2). "robust": as "unit_ball", but mean and largest norm are those of the points that
-            `near_middle` selects. So far outliers, up to some 30 % of the points, do not change the result; they lie
-            outside of the ball. If half of the points or more are at one position, all points are used. "none": the
-            clouds are unchanged, with centre 0 and scale 1.
+            `near_middle` selects. Distant outliers, up to some 30 % of the points, then do not change the result,
+            and lie outside of the ball. If half of the points or more are at one position, all points are used.
+            "none": the clouds are unchanged, with centre 0 and scale 1.
         counts: number of points of each cloud, as `sizes` returns them; None if they are not known yet.
 
     Raises:

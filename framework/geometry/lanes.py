@@ -289,7 +289,7 @@ def how_many(typing, number):
 @intrinsic
 @no_type_check
 def whole(typing, vector):
-    """Return the numbers of a vector rounded towards zero, as int32; they must be in its range."""
+    """Return the numbers of a vector rounded towards zero, as int32; they must be in the range of int32."""
     result = Lanes(types.int32, vector.count)
     return coded(result, (vector,), lambda builder, x: builder.fptosi(x, ir.VectorType(INT32, vector.count)))
 

@@ -162,7 +162,7 @@ def rows(
 
     Args:
         lines: lines of text.
-        row_name: what a line describes, for the message.
+        row_name: noun for the content of a line, for the message.
         width: how many numbers each line has; None: as many as the first line.
         place: function from the index of a line to its number in the file.
 
@@ -180,7 +180,7 @@ def rows(
 
 
 def polygons(lines: Sequence[bytes], place: Place | None = None) -> Int[np.ndarray, "faces 3"]:
-    """Return the triangles of faces.
+    """Return the triangles of the faces that `lines` describe.
 
     Each line describes one face: the number of its corners, then the corners, then any words, which are skipped.
     """

@@ -22,7 +22,7 @@ def revolution(profile: Points, sides: int = 24, edges: Edges = "shared") -> Sol
     Args:
         profile: (radius, height) of each ring, from bottom to top.
         sides: number of sides of a ring.
-        edges: edges that are creases.
+        edges: choice of the edges that are creases (`Edges`).
     """
     radius, height = np.asarray(profile, dtype=np.float64).T
     rings = np.empty((len(profile), sides, 3))

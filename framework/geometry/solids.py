@@ -80,7 +80,7 @@ def loft(rings: Points, edges: Edges = "shared", caps: bool = True) -> Solid:
 
     Args:
         rings: (rings, points, 3).
-        edges: edges that are creases.
+        edges: choice of the edges that are creases (`Edges`).
         caps: if true, fans of triangles close the first and the last ring, which must then be convex. If false, `edges`
             must be "shared".
     """

@@ -84,7 +84,7 @@ class _Step(NamedTuple):
 
 
 class _Problems:
-    """Functions that evaluate the problems: residuals, Jacobians and their sums.
+    """Functions that evaluate the problems: residuals r, Jacobians J, and the sums JᵀJ and Jᵀr.
 
     The user's functions are called on the device of the start; their results are converted to float64 on the CPU.
 

@@ -100,7 +100,7 @@ def markdown(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better 
 
 
 def html(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | None = None) -> str:
-    """Return a table of the results in HTML, whose cells hold the numbers by which a script may sort them.
+    """Return a table of the results in HTML; the attribute `data-value` of a cell is the number to sort by.
 
     If any result is synthetic, a column says which ones are.
     """
@@ -121,7 +121,7 @@ def html(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | No
 
 
 def latex(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | None = None) -> str:
-    """Return a table of the results in LaTeX, which needs no package.
+    """Return a table of the results in LaTeX; the table needs no LaTeX package.
 
     If any result is synthetic, a column says which ones are.
     """

@@ -143,7 +143,7 @@ def _packed_commit(common: Path, name: str) -> str | None:
 
 
 def _is_owned(repository: Repository) -> bool:
-    """Return whether the repository belongs to this user or, if this is root, to the user who called `sudo`."""
+    """Return whether the repository belongs to the current user or, if this user is root, to the caller of `sudo`."""
     user = os.geteuid()
     owners = {
         path.lstat().st_uid for path in (repository.tree, repository.own, repository.link) if path is not None

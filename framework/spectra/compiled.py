@@ -2,7 +2,7 @@
 
 Formulas and the order of the parameters are those of spectrum.py. All functions share the names of these arrays:
     parameters: (spectrum, p) float64, of the preset "ten" or "fifteen".
-    rows: (spectrum,) int64, the rows of `measured`.
+    rows: (spectrum,) int64, row of each spectrum in `measured`.
     measured: (row, offset) float64, NaN where nothing was measured.
     offsets: (offset,) float64, ppm.
     centres: (pool,) float64, ppm from water.
