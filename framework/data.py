@@ -317,5 +317,5 @@ def as_inputs(user_data: Any, shape: tuple[int, ...]) -> Tensor:
 
 
 def _from_three_methods(data: Any) -> Splits:
-    """Return the splits of a data set without the method `splits`, as in old plugins: it has one method per split."""
+    """Return the splits of a data set of an old plugin, which has one method for each split instead of `splits`."""
     return Splits(data.train(), data.validation(), data.test())

@@ -80,10 +80,10 @@ class FitsInputs(ABC):
 
 
 def require_numbers(input_shape: tuple[int, ...], by: str) -> int:
-    """Return how many numbers a sample of this shape holds.
+    """Return the number of elements of a sample of shape `input_shape`.
 
     Raises:
-        ConfigError: a sample of this shape holds no number.
+        ConfigError: a sample of this shape has no elements.
     """
     length = math.prod(input_shape)
     if length == 0:

@@ -295,7 +295,7 @@ class BodyModel(nn.Module):
         return (joints + moved + transforms[..., 9:]).to(self.template.dtype)
 
     def _blended(self, shape: Tensor, turns: Tensor) -> Float[Tensor, "batch 12 vertex"]:
-        """Return Σ_j w_j (R_j - 1, t_j) of each vertex: its skinning weights w_j times the results of `_transforms`."""
+        """Return Σ_j w_j (R_j - 1, t_j) of each vertex: skinning weights w_j times the results of `_transforms`."""
         return self._transforms(shape, turns).to(self.weights.dtype).transpose(1, 2) @ self.weights
 
     def _transforms(self, shape: Tensor, turns: Tensor) -> Float[Tensor, "batch joint 12"]:

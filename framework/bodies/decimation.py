@@ -128,8 +128,8 @@ class _Collapses:
     def _keeps_shape(self, v: int, u: int) -> bool:
         """Return whether vertex v may collapse onto vertex u.
 
-        This is allowed if the mesh stays a manifold (v and u share exactly two neighbours) and no triangle flips
-        (TURN).
+        This is allowed if the mesh stays a manifold (v and u share exactly two neighbours) and no triangle
+        flips (TURN bounds the rotation of its normal).
         """
         if len(self.around[v] & self.around[u]) != 2 or len(self._neighbours(v) & self._neighbours(u)) != 2:
             return False

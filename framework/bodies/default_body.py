@@ -56,7 +56,7 @@ class Traits:
     largest_error: float = 0.0
 
     def coefficients(self, values: Float[Tensor, "person trait"]) -> Float[Tensor, "person shape"]:
-        """Return the shape coefficients of people with these traits.
+        """Return the shape coefficients of people whose traits are the rows of `values`.
 
         The columns of `values` are the traits in `labels`, each 0…1. Traits that have no label are 0.5.
 

@@ -140,9 +140,9 @@ class ParametricBody:
             setattr(self, name, torch.from_numpy(np.ascontiguousarray(values)))
 
     def camera(self, height: int, width: int) -> Camera:
-        """Return a camera that sees the whole body if all its parameters are 0.
+        """Return a camera in front of the body, which sees the whole body if all parameters of the body are 0.
 
-        The camera is in front of the body, at a distance of 1.2 times the height of the body.
+        The distance of the camera is 1.2 times the height of the body.
         """
         low, high = float(self.template[1].min()), float(self.template[1].max())
         return Camera(

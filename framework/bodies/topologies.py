@@ -116,7 +116,7 @@ def sheet(body: Body, stages: int = 2) -> Sheet:
 
 
 def topology(body: Body, surface: Sheet, name: Name) -> Topology:
-    """Return the topology with this name: the body decimated, unchanged, or with its longest edges split.
+    """Return the topology called `name`: the body decimated, unchanged, or with its longest edges split.
 
     The name stands for a number of vertices (COUNTS). For "7k", a body that has fewer vertices stays unchanged. For
     "27k" edges are split once at most and for "110k" twice at most, so a small body can have fewer vertices than the

@@ -50,7 +50,7 @@ def _name_newest_run(arguments: list[str]) -> list[str]:
 
 
 def _put_flags_first(arguments: list[str]) -> list[str]:
-    """Return Hydra's flags followed by the settings, because Hydra reads settings only if they follow each other.
+    """Return Hydra's flags, then all settings, because Hydra does not accept flags between two settings.
 
     Raises:
         ConfigError: A flag is unknown, or lacks its value.

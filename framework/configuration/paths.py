@@ -206,7 +206,7 @@ def require_repeated(stored: Mapping[str, Any], repeated: Mapping[str, Any], fol
 
 
 def shell_arguments(paths: Mapping[str, Any]) -> list[str]:
-    """Return the command-line arguments that set `paths`, which has paths by dotted keys, quoted for a shell."""
+    """Return the command-line arguments, quoted for a shell, that set the paths in `paths`, given by dotted keys."""
     return [shlex.quote(f"{shorten(key)}={_shell_value(value)}") for key, value in paths.items()]
 
 

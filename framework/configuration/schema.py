@@ -195,7 +195,7 @@ def _is_not_number(written: Any) -> bool:
 
 
 def _validation_error(error: ValidationError, path: str, known: Sequence[str]) -> ConfigError:
-    """Return an error that describes the first fault; `known` are the valid keys, which it lists for an unknown key."""
+    """Return an error that describes the first fault; if this is an unknown key, the message lists the keys `known`."""
     fault = error.errors()[0]
     where = shorten(".".join(filter(None, [path, *(str(item) for item in fault["loc"])])))
     # pydantic reports an unknown key of a dataclass by the second type

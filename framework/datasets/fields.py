@@ -47,7 +47,7 @@ class FetchedInBatches(Dataset[Batch], ABC):
 
     @abstractmethod
     def __getitems__(self, indices: Sequence[int]) -> Batch:
-        """Return the samples of these indices as a batch."""
+        """Return the samples with the indices `indices` as a batch."""
 
     def __getitem__(self, index: int) -> Batch:
         return {name: values[0] for name, values in self.__getitems__([index]).items()}

@@ -156,7 +156,7 @@ class PixelLimit:
 
     @contextmanager
     def reserve(self, pixels: int) -> Iterator[None]:
-        """Wait until `pixels` more pixels do not exceed the limit; they count as kept inside the `with` block."""
+        """Wait until `pixels` more pixels fit within the limit, and count them during the `with` block."""
         with self.changed:
             self.changed.wait_for(lambda: not self.reserved or self.reserved + pixels <= self.most)
             self.reserved += pixels
@@ -470,7 +470,7 @@ def load_unlabelled(crops: Sequence[Crop]) -> Fields | Crops:
 
 
 def fit_in_memory(crops: int, side: int, channels: int) -> bool:
-    """Return whether this many crops take at most IN_MEMORY bytes."""
+    """Return whether `crops` crops of `side` × `side` pixels take at most IN_MEMORY bytes."""
     return crops * channels * side**2 <= IN_MEMORY
 
 

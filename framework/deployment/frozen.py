@@ -2,8 +2,8 @@
 
 The computation from features to raw parameters is read from the model's graph (torch.export), so no encoder has to
 declare its layers. If the graph contains fully connected layers only, batch norm is folded into the weights of the
-neighbouring layers, and dropout is removed. One compiled function then computes the raw parameters of one sample, and
-torch's matrix products those of more. Any other model is run by torch unchanged, without gradients.
+neighbouring layers, and dropout is removed. One compiled function then computes the raw parameters of one sample;
+torch computes those of several samples. Any other model is run by torch unchanged, without gradients.
 """
 
 import copy

@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
-    """Return the shape to which tensors of these shapes are broadcast.
+    """Return the shape to which tensors of the given shapes are broadcast.
 
     Raises:
         ValueError: The shapes do not fit each other.
@@ -17,7 +17,7 @@ def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
 
 
 def unravel_index(index: Tensor, shape: Sequence[int]) -> tuple[Tensor, ...]:
-    """Return the index of each dimension of a tensor of this shape, for indices into the flattened tensor."""
+    """Convert indices into a flattened tensor of shape `shape` to one index for each dimension of the tensor."""
     parts: list[Tensor] = []
     for size in reversed(shape):
         parts.append(index % size)

@@ -100,7 +100,7 @@ def predict(
     split: Split = "test",
     reads: Collection[str] = (),
 ) -> Prediction:
-    """Return the prediction for a batch; its random numbers depend on `draw` only, so it is the same in every mode."""
+    """Return the prediction for a batch, the same in every mode, because all random numbers come from `draw`."""
     with draw(split):
         density = predictor(batch["input"])
     return Prediction(density, batch, samples, split, draw, reads)

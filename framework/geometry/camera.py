@@ -127,7 +127,7 @@ def focal_length(height: int, field_of_view: float) -> float:
 
 
 def canonical_camera(height: int, width: int) -> Camera:
-    """Return the canonical camera for images of this size: it is at the origin, and its axes are those of the world.
+    """Return the canonical camera for images of a given size: it is at the origin, with the axes of the world.
 
     The focal length in pixels is the height of the image. The principal point is the centre of the image.
     """

@@ -221,7 +221,7 @@ def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> NormalisedC
 def near_middle(
     offset: Float[Tensor, "batch points 3"], real: Bool[Tensor, "batch points 1"] | None
 ) -> Bool[Tensor, "batch points 1"]:
-    """Return a mask of the points near the middle, which is the point that has the medians as coordinates.
+    """Return a mask of the points near the middle; the medians of the coordinates are the coordinates of the middle.
 
     A point is near if its distance from the middle is at most `REACH` times the median of these distances. If half of
     the points or more are at the middle, all points count as near.

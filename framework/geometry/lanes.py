@@ -74,7 +74,7 @@ def arithmetic(of_reals: str, of_integers: str) -> Make:
 
 @no_type_check
 def comparison(sign: str) -> Make:
-    """Return a function that emits the comparison `sign` ("<", "==", …) of two vectors; it is false for NaN."""
+    """Return a function that emits the comparison `sign` ("<", "==", …) of two vectors, which is false for NaN."""
 
     def make(builder, element, x, y):
         compare = builder.fcmp_ordered if real(element) else builder.icmp_signed  # False for NaN

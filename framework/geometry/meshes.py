@@ -50,7 +50,7 @@ class Mesh:
     dropped: int = 0
 
     def attribute(self, names: Sequence[str]) -> Float[np.ndarray, "vertices names"]:
-        """Return the columns of `attributes` that have these names.
+        """Return the columns of `attributes` with the names `names`.
 
         Raises:
             DataError: no attribute has one of the names, a value is not finite, or a colour lies outside 0…1.

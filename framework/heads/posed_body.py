@@ -59,9 +59,9 @@ class PosedBodyDensity(Independent):
 
 
 def scene_of(body_model: ParametricBody, parameters: Float[Tensor, "parameter"], camera: Camera) -> Scene:
-    """Return the scene of a body with these parameters, seen by a camera.
+    """Return the scene of a body with the given parameters, seen by a camera.
 
-    Its vertex colours have four channels: red, green, blue, and a constant 1 that gives the silhouette.
+    The colours of the vertices have four channels: red, green, blue, and a constant 1 that gives the silhouette.
     """
     return Scene(body_model(parameters), body_model.faces, body_model.colors, camera)
 

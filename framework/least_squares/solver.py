@@ -69,7 +69,7 @@ class _Active(NamedTuple):
         return _Active(*(part[which] for part in self))
 
     def arrays(self, *names: str) -> list[np.ndarray]:
-        """Return the fields with these names as NumPy arrays, which share memory with the tensors."""
+        """Return the fields with the names `names` as NumPy arrays, which share memory with the tensors."""
         return [getattr(self, name).numpy() for name in names]
 
 

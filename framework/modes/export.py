@@ -12,7 +12,7 @@ from framework.storage.enclosed import require_enclosed
 
 
 class ExportOptions(Options):
-    """Options of mode=export: the folder to write; by default `exported` in the folder of this command."""
+    """Options of mode=export: the folder to write; by default `exported` in the run folder of the command."""
 
     into: str | None = None
 

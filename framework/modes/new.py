@@ -86,7 +86,7 @@ def _remove_run_folder(folder: Path) -> None:
 
 
 def _is_single(registry: str) -> bool:
-    """Return whether a config has one plugin of this registry, and not a list of plugins."""
+    """Return whether a config chooses a single plugin of the registry `registry`, and not several."""
     return not (SCAFFOLD / registry / "conf.yaml").read_text(encoding="utf-8").startswith("# @package")
 
 

@@ -80,5 +80,5 @@ def preformatted(text: str) -> str:
 
 
 def folded(summary: str, content: str, *, opened: bool = False) -> str:
-    """Return content, as HTML, that a reader opens by a click on its summary, a plain text."""
+    """Return HTML that shows the plain text `summary`, and after a click on it also the HTML `content`."""
     return f"<details{' open' if opened else ''}><summary>{escape(summary)}</summary>\n{content}</details>\n"

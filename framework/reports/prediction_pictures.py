@@ -46,7 +46,7 @@ def prediction_pictures(session: Session) -> Iterator[tuple[str, Figure]]:
 
 @torch.no_grad()
 def _densities_figure(session: Session) -> Figure:
-    """Return the figure of predicted densities of the first angle, for some of the first PICTURED test samples."""
+    """Return the figure of the predicted densities of the first angle, for samples among the first PICTURED ones."""
     predictor, data = session.predictor, session.data
     inputs: list[Tensor] = []
     columns: list[tuple[Tensor, ...]] = []
@@ -86,7 +86,7 @@ def _densities_figure(session: Session) -> Figure:
 
 @torch.no_grad()
 def _classified_figure(session: Session) -> Figure:
-    """Return the figure of some of PICTURED classified samples, which are spread evenly over the test split."""
+    """Return the figure of classified test samples, chosen from PICTURED samples at equal distances in the split."""
     predictor, data = session.predictor, session.data
     dataset = data.splits().test
     length: int = len(dataset)  # pyright: ignore[reportArgumentType]

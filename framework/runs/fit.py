@@ -177,7 +177,7 @@ def _fit_by_gradient(session: Session, run: Run) -> Fitted:
 
 
 def _give_up(run: Run, error: BaseException) -> None:
-    """Record the error and close the run; the caller ends the process afterwards, because it cannot continue."""
+    """Record the error and close the run; the caller ends the process afterwards, because training cannot continue."""
     stopped = isinstance(error, Stopped)
     sentence = f"stopped by {error.signal}" if isinstance(error, Stopped) else str(error)
     sys.stderr.write(f"{sentence.rstrip('.')}; continue with: python -m framework {resume_arguments(run)}\n")

@@ -9,7 +9,7 @@
 5. The steps after the training (calibration, test) leave nothing to restore; a resumed run repeats them.
 
 `resume_arguments` writes the command that continues a run, and `remove_resume_files` deletes what only a resumed run
-needs. Modules that decide something else by whether a run continues read `Run.resumed`.
+needs. Other modules read `Run.resumed` to find out whether a run continues.
 """
 
 import shlex
@@ -113,7 +113,10 @@ def stored_config(folder: Path) -> dict[str, Any] | None:
 
 
 def may_resume(config: Config) -> bool:
-    """Return whether the run in `config.folder` is unfinished, has this config, and `resume` allows continuing it."""
+    """Return whether the run in `config.folder` continues.
+
+    It continues if it is unfinished, its settings are those of `config`, and the setting `resume` is not "never".
+    """
     earlier = read_run_info(config.folder)
     return (
         earlier is not None

@@ -92,7 +92,7 @@ class Model:
         """Yield a row for each input: point prediction, entropy, ends of the central interval, and prediction set.
 
         Args:
-            inputs: as of a call.
+            inputs: inputs that a call of the model takes.
             interval: probability of the interval; None leaves its ends out. Classes have none.
         """
         density = self(inputs)

@@ -54,9 +54,9 @@ class Problem(NamedTuple):
     """A batch of clouds and their queries, in the form that the kernels read.
 
     Attributes:
-        clouds: (batch, 3 points).
+        clouds: coordinates of the points, (batch, 3 · points).
         sizes: number of points of each cloud, (batch,).
-        queries: queries of each cloud, (batch, 3 queries); empty if all clouds share `packets`.
+        queries: coordinates of the queries of each cloud, (batch, 3 · queries); empty if all clouds share `packets`.
         query_sizes: number of queries of each cloud, (batch,); empty if all clouds share `packets`.
         packets: packed queries that all clouds share.
         moderate: bounds of the largest coordinate (`pack.MODERATE`).
@@ -81,7 +81,7 @@ class Problem(NamedTuple):
 @compiled
 @no_type_check
 def worth_packing(size, packets):
-    """Return true if a cloud of `size` points is searched faster after it is packed, for this number of packets.
+    """Return true if a cloud of `size` points is searched faster after it is packed, for `packets` packets.
 
     As measured, packing a cloud costs as much as comparing it with three packets, and the search for a packet in a
     packed cloud costs as much as comparing it with some hundred points.
