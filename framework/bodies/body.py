@@ -24,8 +24,8 @@ class Body:
         source: origin of the body, for messages.
         template: the vertices of the mean shape in the rest pose.
         faces: rows of `template`, corners counter-clockwise seen from outside.
-        weights: skinning weights: share of each joint's motion that a vertex follows, ≥ 0, of sum 1 (the constructor
-            divides them by their sum).
+        weights: skinning weights, ≥ 0: the share of each joint's motion that a vertex follows. The weights of a vertex
+            sum to 1 (the constructor removes rounding errors of the sum).
         parents: parent of each joint, -1 for the only root.
         joints: positions of the joints in the rest pose of the mean shape.
         shapes, joint_shapes: displacement of vertices and joints by each shape coefficient.
@@ -302,7 +302,7 @@ class BodyModel(nn.Module):
         """Return (R - 1, t) of each joint, float64: the transform x → R x + t from the rest pose to the pose.
 
         The transform includes the rotations of the joint and of all its ancestors. `turns` are the rotations relative
-        to the parents, less the identity.
+        to the parents, minus the identity matrix.
         """
         joints = self.rest_joints(shape).double()
         rotations = list(turns.unbind(1))

@@ -1,4 +1,4 @@
-"""Motions from BVH files (Biovision hierarchy, as of the CMU motion capture) as poses of any body.
+"""Motions from BVH files (Biovision hierarchy, a format of the CMU motion-capture database) as poses of any body.
 
 A body's bones take the directions of the file's bones. The translation of the person is not read, and neither are
 fingers, toes and joints that only some skeletons have.

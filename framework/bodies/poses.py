@@ -198,7 +198,7 @@ def _limited(
 def rotations(
     body: Body, where: Skeleton, movements: Float[np.ndarray, "pose movement"]
 ) -> Float[np.ndarray, "pose joint 3"]:
-    """Return joint rotations for framework.bodies.body, axis times angle in radians, that make these movements."""
+    """Return the joint rotations, axis times angle in radians, with which a body makes the movements `movements`."""
     angle = dict(zip(MOVEMENTS, np.radians(movements).T, strict=True))
     count, joints = len(movements), body.joints.astype(np.float64)
     joint_rotations = [Rotation.identity(count)] * len(body.parents)

@@ -340,7 +340,7 @@ def require_match(mismatch: str | None, name: str) -> None:
 
 
 def find_checkpoint(run_or_checkpoint: object, *, uri: str | None = None) -> Path:
-    """Return the checkpoint file of a run folder, a file or an MLflow run id.
+    """Return the checkpoint file that a run folder, the path of a file or an MLflow run id stands for.
 
     Raises:
         CheckpointError: There is no checkpoint, or the argument is neither a path nor a name.

@@ -230,7 +230,7 @@ def _log_shares(logits: Tensor) -> Tensor:
 
 
 def estimate_of_sum(parts: protocol.Estimate, log_terms: Tensor, log_sum: Tensor) -> protocol.Estimate:
-    """Return the estimate of log Σ_k t_k from the estimates of the terms t_k, which the last dimension counts.
+    """Return the estimate of log Σ_k t_k from the estimates of the terms t_k; k is the last dimension.
 
     The terms must be estimated from independent draws. By the delta method, the squared standard error of the log-sum
     is Σ_k (t_k / Σ_j t_j)² s_k², where s_k is the standard error of log t_k. The numbers of samples add up.
@@ -253,7 +253,7 @@ def estimate_of_sum(parts: protocol.Estimate, log_terms: Tensor, log_sum: Tensor
 
 @protocol.estimate.register
 def _(density: Mixture, value: Tensor) -> protocol.Estimate:
-    """Return the estimate of a mixture whose components draw independently; for one component, the component's own."""
+    """Return the estimate of a mixture whose components draw independently; for one component, its estimate."""
     several = density.split_values(value)
     if len(several) > 1:
         return concatenate_estimates([protocol.estimate(density, part) for part in several])
@@ -277,12 +277,14 @@ def _(density: Mixture, index: int) -> Distribution:
 
 @protocol.median.register
 def _(density: Mixture, samples: int) -> Tensor:
-    """Return the median of a single component, or of several over one real number whose distribution function is known.
+    """Return the median of a mixture.
 
-    For all others it is the median of draws (the default of `median`).
+    It is computed without draws for a single component whose median is known, and for components over one real number
+    whose distribution function is known. For all others it is the median of draws (the default of `median`).
 
-    For several components over images the mean is returned, as `framework.deployment.frozen.Frozen` does: the median of
-    few draws is a noisy image, and the median from the distribution function takes a second of processor time.
+    For several components over images, the mean is returned instead, as `framework.deployment.frozen.Frozen` does: the
+    median of few draws is a noisy image, and the median from the distribution function takes a second of processor
+    time.
     """
     if density.log_weights.shape[-1] == 1:
         return protocol.median(density.components, samples).squeeze(-1 - len(density.event_shape))

@@ -35,9 +35,9 @@ def highest(density: Distribution, starts: Tensor) -> Tensor:
 def crossings(components: Distribution, modes: Tensor) -> Tensor:
     """Return starting points between every two of K components, for the search for a mixture's mode.
 
-    Two components that are narrow in different numbers may together be highest at a point far from both of their modes.
-    The starting point for such a pair is the maximum of the product of two quadratic bounds: of the first component and
-    of the second, both at the mode of the first.
+    Two components that are narrow along different coordinates may together be highest at a point far from both of their
+    modes. The starting point for such a pair is the maximum of the product of two quadratic bounds: of the first
+    component and of the second, both at the mode of the first.
 
     Args:
         components: a density with batch_shape (*batch, K).

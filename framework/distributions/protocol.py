@@ -336,8 +336,8 @@ def highest_region(
         density: a density of one number, with batch_shape (*batch).
         value: the given value of `Region`, (*batch, 1).
         mass: probability of the region whose size is returned, in (0, 1).
-        equal: relative difference up to which two densities count as equal, so that rounding has no influence; by the
-            dtype of the density, float32 or float64.
+        equal: for each dtype of the density (float32, float64), the relative difference up to which two densities
+            count as equal, so that rounding has no influence.
     """
     return None
 

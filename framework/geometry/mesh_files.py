@@ -88,7 +88,7 @@ def line_numbers(
         comment: as for `text_lines`.
         names: as for `text_lines`.
         key: if not empty, only lines with this first word are counted.
-        first: number of counted lines before the line to which the function assigns index 0.
+        first: number of counted lines before the line with index 0.
     """
 
     def place(line: int) -> int:

@@ -33,10 +33,10 @@ class Solution(NamedTuple):
     Attributes:
         parameters: (problem, p), within the bounds.
         cost: (problem,), half the sum of squared residuals, as in SciPy.
-        covariance: (problem, p, p), covariance of the parameters, s² (JᵀJ)⁻¹. J is the Jacobian, also by parameters
-            that are at a bound, and s² = 2 cost / (number of residuals - p). If the rank is less than p, the inverse is
-            the pseudo-inverse: directions that the data do not determine then have variance 0. If the status is
-            NOT_FINITE, the diagonal is infinite.
+        covariance: (problem, p, p), covariance of the parameters, s² (JᵀJ)⁻¹. J is the Jacobian with respect to all
+            parameters, including those at a bound, and s² = 2 cost / (number of residuals - p). If the rank is less
+            than p, the inverse is the pseudo-inverse: directions that the data do not determine then have variance 0.
+            If the status is NOT_FINITE, the diagonal is infinite.
         rank: (problem,), rank of the Jacobian with its columns scaled to unit length; p if all parameters are
             determined.
         status: (problem,), values of `Status`.

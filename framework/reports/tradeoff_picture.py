@@ -78,7 +78,7 @@ def error_against_run_time(
     Args:
         rows: as for `framework.reports.table`, each with its "method".
         labels: label of the axis, by key.
-        better: direction in which a key is better; "lower" is an error.
+        better: for each key, the direction in which it is better; a key with "lower" is an error.
         title: title of the figure.
         synthetic: whether the data are generated.
         machine: machine and number of threads of the measurement, which is written on every time axis.

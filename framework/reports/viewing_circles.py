@@ -66,7 +66,10 @@ def count_peaks(log_density: Float[np.ndarray, "points samples"]) -> np.ndarray:
 
 
 def outer_density(peak: float) -> float:
-    """Return the density of the outer circle, per radian: the first of 1.5, 3, 6, 15, 30, … that is at least `peak`."""
+    """Return the density that the outer circle represents, per radian.
+
+    It is the first of 1.5, 3, 6, 15, 30, … that is at least `peak`.
+    """
     steps = (step * 10.0**power for power in range(308) for step in (1.5, 3.0, 6.0))
     return next(step for step in steps if step >= peak)
 

@@ -212,14 +212,14 @@ def extent(cloud, size, box):
 @inlined
 @no_type_check
 def cells_per_unit(size, grid, real):
-    """Return the factor from coordinates, relative to the lowest, to cells; the highest coordinate is in the last cell.
+    """Return the number of cells per unit of length, with which the highest coordinate is in the last cell.
 
-    If the extent is at most FLAT, the factor is 0, and all points are in one cell.
+    If the extent is at most FLAT, the number is 0, and all points are in one cell.
 
     Args:
         size: extent of the points along the longest axis.
         grid: number of cells along an axis.
-        real: type of the factor.
+        real: type of the result.
     """
     return real(grid * 0.9999) / size if size > FLAT else real(0)
 

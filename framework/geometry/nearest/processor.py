@@ -196,7 +196,7 @@ def curves(bits: int) -> NDArray[np.int32]:
 
 
 def packed_once(points: Array) -> Packed:
-    """Return packed queries, fast, for queries that are used once: the packets follow the Hilbert curve (`pack`)."""
+    """Pack queries that are used once, as fast as possible: the packets follow the Hilbert curve (`pack`)."""
     size, box = len(points), np.empty(6, points.dtype)
     low, high = MODERATE[points.itemsize]
     flat = points.reshape(-1)
@@ -209,7 +209,7 @@ def packed_once(points: Array) -> Packed:
 
 
 def packed_well(points: Array) -> Packed:
-    """Return packed queries, for queries that are used often: the packets come from repeated halving at the median.
+    """Pack queries that are used often: the packets come from repeated halving at the median.
 
     This takes longer than `packed_once`, but the boxes of the packets are smaller.
     """
@@ -245,7 +245,7 @@ KEPT = 2**20
 
 
 class Desks(local):
-    """Working memory of each thread, which is kept, since new memory takes a large share of the time of a search."""
+    """Working memory of each thread, kept between searches, since to allocate it takes a large share of their time."""
 
     def __init__(self) -> None:
         self.cached: dict[tuple[int, int, np.dtype, int], tuple[Bench, Packed, Packed]] = {}

@@ -256,7 +256,7 @@ def lowest_id(packed, x, y, z, best, number):
 def descend(packed, x, y, z):
     """Return the position of a point near a query, found by following the nearest box of each level.
 
-    The position is 16 times the leaf, plus the lane of the point in the leaf.
+    The position is 16 times the index of the leaf, plus the index of the point in the leaf.
     """
     points, _, box, _, levels = packed
     nodes = box.shape[0] // 6
