@@ -20,7 +20,8 @@ python -m framework --help                        experiments, methods, data
 python -m framework mode=plugins                  methods and their papers
 python -m framework mode=new mode.plugin=density_head/my_head
                                                   start a method of your own
-docs/commands.md lists all commands, also those for your own files.
+docs/start/by_task.md names the first command for your task and your own files;
+docs/commands.md lists all commands.
 """
 """Text for a command without arguments."""
 
