@@ -21,7 +21,7 @@ OFFSETS = (
 
 
 def offsets_of(configured: Sequence[float] | None) -> tuple[float, ...]:
-    """Return the offsets of a config; None means OFFSETS.
+    """Return the frequency offsets that a config sets, ppm; if it sets None, return OFFSETS.
 
     Raises:
         DataError: there are fewer than two offsets, or they do not ascend.

@@ -41,7 +41,7 @@ class Parameters(NamedTuple):
 
     @classmethod
     def of(cls, preset: Preset) -> "Parameters":
-        """Return the parameters of five pools.
+        """Return the parameters of the spectral lines of five proton pools for a preset.
 
         "ten": ten amplitudes and widths are the target; the shift of water is fitted too, and the centres of the other
         pools are fixed (thesis §4.1). "fifteen": amplitudes, widths and centres are the target, and nothing is fixed.
@@ -60,7 +60,7 @@ class Parameters(NamedTuple):
 
 
 def _parameters(free: bool) -> Parameters:
-    """Return the parameters of five pools; `free` says whether the centres of all lines are fitted."""
+    """Return the parameters of five spectral lines; if `free` is true, the centres of all lines are fitted."""
     columns = (
         *((f"{pool}_amplitude", 0.0, 1.0, start) for pool, start in zip(POOLS, AMPLITUDES, strict=True)),
         *((f"{pool}_width_ppm", *box) for pool, box in zip(POOLS, WIDTHS, strict=True)),
@@ -94,7 +94,7 @@ def centres(parameters: Float[Tensor, "batch p"]) -> Float[Tensor, "batch pool"]
 def spectrum(
     parameters: Float[Tensor, "batch p"], offsets: Float[Tensor, "offset"]
 ) -> Float[Tensor, "batch offset"]:
-    """Return Z at the offsets (ppm) for parameters of either preset."""
+    """Return Z at the offsets (ppm) for parameters of the preset "ten" or "fifteen" (`Parameters.of`)."""
     amplitude, width = parameters[:, :COUNT, None], parameters[:, COUNT : 2 * COUNT, None]
     square = (width / 2).square()
     lines = amplitude * square / (square + (offsets - centres(parameters).unsqueeze(-1)).square())

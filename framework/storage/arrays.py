@@ -60,7 +60,7 @@ def map_npy(path: Path) -> NDArray:
 
 
 def _read_header(stream: BinaryIO, size: int) -> tuple[tuple[int, ...], Literal["C", "F"], np.dtype]:
-    """Return shape, order and type of the array in an .npy file of `size` bytes; the stream is then at its numbers."""
+    """Return shape, order and type of the array in an .npy file of `size` bytes, and read only the header."""
     version = layout.read_magic(stream)
     if version not in HEADERS:
         raise ValueError(

@@ -36,7 +36,7 @@ class _Signal(ModuleType):
 
 @contextmanager
 def _standing_in(*modules: ModuleType) -> Iterator[None]:
-    """Let import statements in the block find these modules, unless the modules of the same names are loaded."""
+    """Let imports in the block return these stand-ins, unless the modules that they replace are already loaded."""
     added = [module for module in modules if sys.modules.setdefault(module.__name__, module) is module]
     try:
         yield

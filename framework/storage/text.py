@@ -194,7 +194,7 @@ UNIT = re.compile(
 
 
 def suggest_number(word: str) -> Suggestion | None:
-    """Return how to write a word, if it is a number in an unusual form, as a plain number; None for any other word.
+    """Return the correction of a word that is a number in an unusual form; None for any other word.
 
     Examples of unusual forms are a decimal comma, separators between thousands, and a unit.
     """
@@ -212,7 +212,7 @@ def suggest_number(word: str) -> Suggestion | None:
 
 
 def _separated(sign: str, figures: str) -> Suggestion | None:
-    """Return how to write a number with a decimal comma or digits in groups; None if the number has neither."""
+    """Return the correction of a number with a decimal comma or digits in groups; None if it has neither."""
     decimal = {"decimal": "comma"}
     if re.fullmatch(r"\d*,\d+(?:[eE][+-]?\d+)?|\d+,", figures):
         number = sign + figures.replace(",", ".")

@@ -305,8 +305,8 @@ def _evaluate_boxes(
 
     The corners are `low` and `high`. Masses and urgency have shape (box, rows). The axis is a mask (box, rows, number).
     The urgency is the difference of the integrals by the two rules. The urgency is raised if the integrand at a
-    candidate or near a known peak is far above the integrand at every node, or if it is not at a known peak what it is
-    expected to be from the nodes.
+    candidate or near a known peak is far above the integrand at every node. It is also raised if the integrand at a
+    known peak differs from its extrapolation from the nodes.
 
     Args:
         mapping: Map from coordinates to values.

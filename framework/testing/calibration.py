@@ -46,7 +46,7 @@ class Calibration:
 
     @cached_property
     def target(self) -> Target:
-        """Target of the contract row; a real-valued one gets another unit, as no code may assume targets of size 1."""
+        """Target of the contract row; a real-valued one is in another unit, since targets may have any size."""
         return in_units(self.row.target)[:2][-1]
 
     def make(self, target: Target | None = None) -> Uncertainty:

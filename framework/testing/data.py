@@ -240,7 +240,7 @@ def _samples_differ(bench: Workbench, worst: Worst) -> None:
 
 
 def _measured(inputs: Tensor) -> bool:
-    """Return true for measured inputs, and false for a few integers, which may be equal in two samples by chance."""
+    """Return whether two inputs like this one can hardly be equal by chance; false for inputs of a few integers."""
     trimmed_inputs = remove_padding(inputs)
     return trimmed_inputs.numel() >= 16 or (
         trimmed_inputs.is_floating_point() and bool((trimmed_inputs != trimmed_inputs.round()).any())

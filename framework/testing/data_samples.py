@@ -83,7 +83,7 @@ def samples(split: Any) -> Iterator[tuple[int, Batch]]:
 
 
 def batches(indices: Sequence[int], sizes: Sequence[int]) -> Iterator[list[int]]:
-    """Yield `indices` in consecutive batches, whose sizes are those in `sizes`, again and again."""
+    """Yield `indices` in consecutive batches, whose sizes repeat the sequence `sizes`."""
     start = count = 0
     while start < len(indices):
         size = sizes[count % len(sizes)]

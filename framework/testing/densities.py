@@ -522,9 +522,9 @@ def median_is_best(density: Distribution, worst: Worst) -> None:
 def moments(density: Distribution, worst: Worst) -> None:
     """Compare mean and variance, if the density has them, with the quadrature; errors are in standard deviations.
 
-    The nodes of the quadrature are chosen for the density, so that its moments have an error for heavy tails. Only
-    differences beyond this error count. If the density states that its variance does not exist, the variance by the
-    quadrature must be huge, and the mean need not exist either.
+    The nodes of the quadrature are chosen for the density and not for its moments, so for heavy tails the moments by
+    the quadrature have an error. Only differences beyond this error count. If the density states that its variance does
+    not exist, the variance by the quadrature must be huge, and the mean need not exist either.
     """
     quadrature = boxes(density)
     offset = quadrature.value - quadrature.mapping.mode  # keeps the digits of a narrow density far from 0
@@ -567,7 +567,8 @@ def moments(density: Distribution, worst: Worst) -> None:
 def masses(density: Distribution, worst: Worst) -> None:
     """Compare `cdf`, or `arc_probability` and `trigonometric_moments`, if known, with the quadrature.
 
-    The values are the mode ± {0, 0.3, 1, 3, 30} widths of the density. Moments are compared where a grid is exact.
+    Probabilities are compared at the mode ± {0, 0.3, 1, 3, 30} widths of the density. Moments are compared for the
+    densities that a fixed grid integrates to 1.
     """
     quadrature = boxes(density)
     offset = torch.tensor([-30, -3, -1, -0.3, 0, 0.3, 1, 3, 30], dtype=torch.float64)[:, None]

@@ -296,14 +296,17 @@ def _mixture_of_one(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _knobs(subject: HeadSubject, worst: Worst) -> None:
-    """Check that the values of each knob are in ascending order, and that log_prob is finite with the smallest two."""
+    """Check that the values of each knob ascend, and that log_prob is finite for the two smallest values."""
     head = subject.make()
     worst.count(False, "the head has no knobs")
     check_knobs(head, lambda: head(subject.raw_parameters(3)).log_prob(subject.values(3)), worst)
 
 
 def check_knobs(plugin: DensityHead | Uncertainty, log_prob: Callable[[], Tensor], worst: Worst) -> None:
-    """Check the order of the values of each knob, and that log_prob is finite with the smallest two."""
+    """Check that the values of each knob ascend, and that log_prob is finite for the two smallest values.
+
+    A knob is a setting that trades error for run time after training.
+    """
     for name, settings in plugin.knobs.items():
         worst.same(f"order of {name}", list(settings), sorted(settings))
         for setting in settings[:2]:

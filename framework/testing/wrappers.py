@@ -276,7 +276,7 @@ def _side_effects(make: Make, row: WrapperRow, worst: Worst) -> None:
 
 
 def _knobs(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """Check that the values of each knob are in ascending order, and that log_prob is finite with the smallest two."""
+    """Check that the values of each knob ascend, and that log_prob is finite for the two smallest values."""
     wrapper = make()
     worst.count(False, "the wrapper has no knobs")
     check_knobs(wrapper, lambda: wrapper(inputs(3)).log_prob(values(row.target, (3,))), worst)

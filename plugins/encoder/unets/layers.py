@@ -59,9 +59,10 @@ class Layer(nn.Module):
             self.register_buffer("batches", torch.zeros((), dtype=torch.long))
 
     def forward(self, maps: Float[Tensor, "batch channels height width"]) -> Tensor:
-        """Return the output maps of the layer in training; with "group", evaluation computes the same.
+        """Return the output maps of the layer, as training computes them.
 
-        With "batch" and "renorm", evaluation uses the function that `fold` returns.
+        With the normalisation "group", evaluation computes the same maps. With "batch" and "renorm", evaluation does
+        not call this method, but the function that `fold` returns.
         """
         return self._normalise(convolve(maps, self.weight, None, self.stride))
 

@@ -34,7 +34,7 @@ class Slim(Encoder):
         normalisation, colors, scales, crop, precision, residual: as in `unet.UNet`.
 
     Attributes:
-        report: areas of the last batch that evaluation computed; None after training, and without crop.
+        report: areas of the images of the last batch that evaluation computed; None after training, and without crop.
 
     Raises:
         ConfigError: the input is no image, or `crop` with `normalisation="group"`.
@@ -95,7 +95,7 @@ class Slim(Encoder):
 
 
 def unshuffle_pixels(images: Float[Tensor, "batch channels height width"], side: int) -> Tensor:
-    """Return the result of `functional.pixel_unshuffle` with channels last, in a third of the time."""
+    """Return what `functional.pixel_unshuffle` returns, with channels last in memory, in a third of its time."""
     batch, channels, height, width = images.shape
     squares = images.reshape(batch, channels, height // side, side, width // side, side)
     planes = squares.permute(0, 1, 3, 5, 2, 4).reshape(

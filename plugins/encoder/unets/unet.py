@@ -39,7 +39,7 @@ class UNet(Encoder):
             rasterised mesh. Before training the output is then the input. Colours may lie a little beyond [0, 1].
 
     Attributes:
-        report: areas of the last batch that evaluation computed; None after training, and without crop.
+        report: areas of the images of the last batch that evaluation computed; None after training, and without crop.
 
     Raises:
         ConfigError: the input is no image, or `crop` with `normalisation="group"`.

@@ -230,7 +230,7 @@ def sum_by_bin(
     index: Int[Tensor, "sample"],
     bins: int,
 ) -> Bins:
-    """Return counts and sums for each bin; `index` is the bin of each sample."""
+    """Return the sums over the samples of each bin; `index` holds the bin of each sample."""
     columns = torch.stack([torch.ones_like(right), confidence, right], -1)
     return Bins(*columns.new_zeros(bins, 3).index_add_(0, index, columns).unbind(-1))
 

@@ -30,13 +30,14 @@ SECANTS = 2
 
 
 def border(density: Distribution, value: Tensor, mass: float, samples: int) -> Region:
-    """Return the masses and the size of highest-density regions.
+    """Return `Region`: the masses of the regions that end at the targets, and the size of the region of mass `mass`.
 
-    They are exact for classes, for normal densities, where `highest_region` knows them, and for an angle whose density
-    a grid resolves. Otherwise they are estimated from `samples` draws: the masses follow from the rank of the target's
-    density among those of the draws. This rank depends on the draws, but it is exactly uniform if the density is the
-    true one. The size is in labels, radians or the unit of the target, and NaN for a target of several numbers. If the
-    target is drawn from the density, a number drawn uniformly between the masses `low` and `high` is uniform on [0, 1].
+    Both are exact for classes, for normal densities, for densities that `highest_region` knows, and for an angle whose
+    density a grid resolves. Otherwise both are estimated from `samples` draws: the masses follow from the rank of the
+    target's density among the densities of the draws. This rank depends on the draws, but it is exactly uniform if the
+    density is the true one. The size is a number of labels, or is in radians or the unit of the target; it is NaN for a
+    target of several numbers. If the target is drawn from the density, a number drawn uniformly between the masses
+    `low` and `high` is uniform on [0, 1].
 
     Args:
         density: batch_shape (batch,).
@@ -280,7 +281,7 @@ def _count_cells(mass: Float[Tensor, "cell batch"], wanted: float) -> Float[Tens
 def coverage_probability(
     low: Tensor, high: Tensor, levels: Float[Tensor, "level"]
 ) -> Float[Tensor, "batch level"]:
-    """Return for each level the probability that a number drawn uniformly from [`low`, `high`] is at most it.
+    """Return for each level the probability that a number drawn uniformly from [`low`, `high`] does not exceed it.
 
     This probability replaces a random draw if other values have the same density as the target (nonrandomized transform
     of Czado, Gneiting & Held 2009, eq. 2).

@@ -25,8 +25,8 @@ REGION = 0.9
 class Coverage(Metric, HasFigure):
     """Share of targets that lie in the highest-density regions of given masses.
 
-    If the densities are the true ones, the mass h(x, y) of all values that are at least as dense as the target is
-    uniform on [0, 1]. This holds for every kind of target: classes, real numbers, angles, rotations.
+    Let h be the probability of all values whose density is at least that of the target. If the predicted densities are
+    the true ones, h is uniform on [0, 1]. This holds for classes, real numbers, angles and rotations.
 
     - `coverage_50`, `coverage_90`: share of targets within the regions of mass 0.5 and 0.9.
     - `coverage_error`: mean |share - mass| over the masses 0.05, 0.10, ..., 0.95.
@@ -35,8 +35,9 @@ class Coverage(Metric, HasFigure):
       regions is better.
 
     If many values have the same density as the target, as classes often do, h can be any number between two masses:
-    that of all denser values, and that of all values at least as dense. A target is then counted with the probability
-    that a number drawn uniformly between these two is at most the mass of the region.
+    the mass of all values with a higher density, and the mass of all values whose density is at least that of the
+    target. The target then counts with the probability that a number drawn uniformly between these two masses is at
+    most the mass of the region.
 
     Args:
         samples: number of draws for a density whose regions are not known: several angles, rotations, mixtures over

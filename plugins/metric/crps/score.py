@@ -26,7 +26,7 @@ class Score(NamedTuple):
 
     Attributes:
         mean: the score.
-        error: standard error of the score due to draws; 0 if the score is exact.
+        error: standard error of a score that is estimated from draws; 0 if the score is exact.
     """
 
     mean: Tensor

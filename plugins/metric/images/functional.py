@@ -119,7 +119,7 @@ def least_side(scales: int) -> int:
 
 
 def silhouette_iou(predicted: Mask, true: Mask) -> Float[Tensor, ""]:
-    """Return the number of pixels in both masks divided by the number in either mask; NaN if both are empty."""
+    """Return the number of pixels in both masks, divided by the number in at least one; NaN if both are empty."""
     return (predicted & true).sum().double() / (predicted | true).sum()
 
 

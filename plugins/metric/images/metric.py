@@ -16,7 +16,7 @@ Encoding = Literal["srgb", "linear"]
 
 
 def encode_colors(light: Float[Tensor, "height width number"], encoding: Encoding) -> Tensor:
-    """Return colours, given as linear RGB, in an encoding, clipped to [0, 1], float64."""
+    """Return colours of linear RGB in the encoding `encoding`, clipped to [0, 1], float64."""
     return srgb_from_linear(light.double()) if encoding == "srgb" else light.double().clamp(0, 1)
 
 

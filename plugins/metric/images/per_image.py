@@ -93,7 +93,8 @@ class PerImage(Metric, HasFigure):
         """Choose which of the stored images and the images of a batch are kept for the figure.
 
         Args:
-            facts: score and data set index of each image, (1, 2), first of the stored images, then of the batch.
+            facts: for each stored image and then for each image of the batch, its score and its index in the data set,
+                (1, 2).
             predicted: predicted images of the batch.
             true: true images of the batch.
         """

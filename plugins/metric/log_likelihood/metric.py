@@ -18,7 +18,7 @@ _log = logging.getLogger(__name__)
 
 
 class Moments(Metric):
-    """Base class of the metrics of log-likelihood; its states are moments, and sums for the sampling error."""
+    """Base class of the metrics of log-likelihood, whose states are moments, and sums for the sampling error."""
 
     moments: Tensor
     sampling: Tensor
@@ -88,7 +88,7 @@ class NegativeLogLikelihood(Moments):
 def warn_of_unlikely(prediction: Prediction) -> None:
     """Log a warning if real-valued targets are more than UNLIKELY nats less likely than the median of their batch.
 
-    A mean over all samples hides that a few of them decide it.
+    Otherwise the mean log-likelihood would hide that a few samples dominate it.
     """
     log_prob = prediction.log_prob.detach()
     if len(log_prob) == 0 or prediction.split != "test" or prediction.target.dim() != 2:

@@ -16,7 +16,7 @@ from framework.target import Target
 class PredictionSetMetric(Metric):
     """Coverage and mean size of the predicted sets, and the share of empty sets.
 
-    - `set_coverage`: share of targets in their sets, with its standard error; 1 - miscoverage is best.
+    - `set_coverage`: share of targets in their sets, with its standard error; best: the stated probability.
     - `set_size`: mean number of labels; for real numbers, the mean length or volume in the target's unit; for several
       angles, the mean volume in radians to the power of their number. For one angle, the result is `set_size_deg`, the
       mean length of the arcs in degrees. It is infinite if a set is unbounded.

@@ -1,4 +1,4 @@
-"""Contract-test cases.
+"""Contract-test cases: densities without prediction sets.
 
 The densities of the contract tests have no prediction sets. test_prediction_set_metric.py runs the checks on sets.
 """

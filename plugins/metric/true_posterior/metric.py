@@ -37,7 +37,7 @@ class TruePosterior(Metric):
 
     Args:
         target: a target that contains an angle named "azimuth".
-        points: number of azimuths on the grid; the grid resolves concentrations up to points²/40.
+        points: number of azimuths on the grid; the grid resolves von Mises concentrations κ up to points²/40.
         largest_symmetry: largest n that is allowed in the field "symmetry".
 
     Raises:

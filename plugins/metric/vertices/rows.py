@@ -1,4 +1,4 @@
-"""Contract-test cases: meshes of one, four and five vertices; the latter in scans of three people."""
+"""Contract-test cases: meshes of one and four vertices, and meshes of five vertices of three people."""
 
 import torch
 from torch import Tensor

@@ -17,7 +17,7 @@ ANGLES = ("azimuth", "elevation", "tilt")
 
 
 class Viewpoint(Metric):
-    """Acc_π/6 and MedErr: share within 30° of the true rotation, and the median error in degrees.
+    """Acc_π/6 and MedErr: share of predictions within 30° of the true rotation, and median error in degrees.
 
     Both use the distance Δ(R₁, R₂) = ||log(R₁ᵀR₂)||_F / √2 between the rotation matrices of the true and the predicted
     viewpoint (Tulsiani & Malik 2015; thesis Table 3.3). The median of an even number of errors is the mean of the

@@ -51,7 +51,7 @@ class VGG(nn.Module):
             channels = widths[block]
 
     def forward(self, images: Float[Tensor, "image 3 height width"]) -> list[Tensor]:
-        """Return the features (image, channel, height, width) after each tap, for sRGB images, in their dtype."""
+        """Return the features (image, channel, height, width) of sRGB images after each convolution in `taps`."""
         mean, spread = (images.new_tensor(values)[:, None, None] for values in (MEAN, SPREAD))
         hidden, features, block_before = (images - mean) / spread, [], 0
         for block, place, _ in self.layers:
@@ -67,15 +67,15 @@ class VGG(nn.Module):
 
     @property
     def least_side(self) -> int:
-        """Smallest side of an image, pixels, for which the features at the last tap exist."""
+        """Smallest side of an image, pixels, that is large enough for all pooling layers before the last features."""
         return 2 ** self.taps[-1][0]
 
 
 def layers_of(depth: Depth, last: tuple[int, int]) -> list[tuple[int, int, int]]:
-    """Return all convolutions up to the last tap, in order, with their indices in torchvision's files.
+    """Return all convolutions up to `last`, in order, with their indices in torchvision's files.
 
     Each is a triple: block, number of the convolution in the block, and index in torchvision's `features`. `last` is
-    the block and the number of the last tap.
+    the block and the number of the last convolution whose output is a feature.
     """
     layers, index = [], 0
     for block, count in enumerate(CONVOLUTIONS[depth]):

@@ -291,7 +291,8 @@ def depth_at(camera_points, faces, index, ray_x, ray_y):
 def add_screen_gradient(camera_points, vertex, axis, slope, lens, grad_points, grad_lens):
     """Add the gradient through the screen coordinate f x / z + c of a vertex.
 
-    `slope` is the gradient of the loss with respect to this coordinate along `axis`, per pixel.
+    f is the focal length and c the principal point along `axis` (0: column, 1: row), pixels; x and z are camera
+    coordinates. `slope` is the gradient of the loss with respect to the screen coordinate, per pixel.
     """
     focal, inverse = lens[axis], 1.0 / camera_points[vertex, 2]
     ratio = camera_points[vertex, axis] * inverse

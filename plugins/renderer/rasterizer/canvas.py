@@ -73,7 +73,7 @@ class MeshCache:
         self._meshes: list[Corners] = []
 
     def find(self, indices: np.ndarray) -> Corners:
-        """Return the `Corners` of `indices`, (faces, 3), from the cache if it holds them.
+        """Return the `Corners` of `indices`, (faces, 3), from the cache; if it lacks them, add them first.
 
         The indices are those of vertices or of texture coordinates.
         """

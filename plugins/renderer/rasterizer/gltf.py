@@ -81,7 +81,7 @@ def read(file: Path) -> Subject:
 
 
 def _find_unsupported(document: Document, key: str) -> list[str]:
-    """Return the names of the extensions in a list of the file that are not supported."""
+    """Return the unsupported extensions among those that the file lists under `key`."""
     return [name for name in document.content.get(key, ()) if not name.startswith(SUPPORTED)]
 
 

@@ -172,7 +172,7 @@ class TextureDecoder:
         return self._decoded.get(key)
 
     def read(self, file: Path) -> Float[Tensor, "height width 3"]:
-        """Decode an image file as `decode` does, if `file` was not read before.
+        """Return the texture in an image file, which is read and decoded (`decode`) at the first call only.
 
         Raises:
             DataError: the file cannot be read, is not an image, or the image is too large.

@@ -38,7 +38,7 @@ class SoftImage:
     Attributes:
         positions: (vertices, 2) float64, column and row, pixels.
         bounds: (faces, 4) int64, first row, last row + 1, first column, last column + 1 of the pixels near a face.
-        nearest: index of the nearest vertex in view, the unit of depths; -1 if nothing is in view.
+        nearest: index of the nearest vertex in view, whose depth is the unit of depths; -1 if nothing is in view.
         scales: 1 / σ in 1/pixel², γ, and the result of `blur_margin`, pixels.
         most: (height, width) float64, the largest z_j, or ε if it is larger.
         total: (height, width) float64, Σ_j D_j exp((z_j - most) / γ) plus the background's term exp((ε - most) / γ).

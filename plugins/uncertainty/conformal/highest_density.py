@@ -264,9 +264,10 @@ class Line:
     def _tops(
         self, places: Float[Tensor, "candidate item"], heights: Float[Tensor, "candidate item"]
     ) -> Bool[Tensor, "candidate item"]:
-        """Return for each candidate whether it can be the highest of its hump.
+        """Return for each candidate whether it may be the highest one on its hump, the region around a local maximum.
 
-        It can if each neighbour is lower or is separated from it by a valley (PARTED). The candidates ascend.
+        It may be if each of its two neighbours is lower, or is separated from it by a valley (PARTED). The candidates
+        are in ascending order of position.
         """
         ahead = places.roll(-1, 0) - places
         ahead = wrap(ahead) if self.closed else ahead

@@ -64,7 +64,13 @@ class PredictionSet(Density):
         return self.contains(shaped[..., None]).reshape(points.shape)
 
     def _pairs(self, points: Array, above: Any, ends: Array) -> list[tuple[float, float]]:
-        """Return the intervals of one item from its ascending points, their masks, and the ends between them."""
+        """Return the intervals of one item in which the density is high enough.
+
+        Args:
+            points: ascending points.
+            above: for each point, whether it is in the set.
+            ends: for each pair of neighbouring points, the end of an interval that may lie between them.
+        """
         changes = np.flatnonzero(above[1:] != above[:-1])
         edges = [float(ends[index]) for index in changes]
         if not edges:

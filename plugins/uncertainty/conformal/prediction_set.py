@@ -356,7 +356,7 @@ def _(density: PredictionSet) -> PredictionSet:
 def _(density: PredictionSet, index: int) -> Distribution:
     """Return the marginal density of one number, without a prediction set.
 
-    The set has its coverage for all numbers together, which is not the coverage of one number.
+    The coverage of the set holds for all numbers together, and says nothing about a single number.
     """
     return density if tuple(density.event_shape) == (1,) and index == 0 else marginal(density.density, index)
 

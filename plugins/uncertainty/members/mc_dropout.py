@@ -33,8 +33,8 @@ class Layout(NamedTuple):
     Attributes:
         vectorised: True if `torch.vmap` runs the network; layers before the first dropout layer are then computed only
             once for all masks. False if the network is run on one copy of each input for each mask.
-        widest: memory for one input and one mask: the largest number of values that enter a dropout layer or, without
-            vmap, the network.
+        widest: largest number of values that enter a dropout layer or, without vmap, the network, for one input and one
+            mask. It measures the memory that a pass needs.
     """
 
     vectorised: bool

@@ -25,7 +25,7 @@ class Minimum(NamedTuple):
         point: position of the minimum within the bounds, float64.
         value: value at the minimum, never above the value at the start.
         active: for each parameter, -1 if it is at its lower bound, 1 if it is at its upper bound, and 0 otherwise. A
-            bound counts only if the sum would fall further beyond it.
+            bound counts only if the minimised sum would be lower beyond it.
     """
 
     point: Float[Tensor, "n"]

@@ -35,8 +35,8 @@ class Platt(Uncertainty):
     b have these values before `calibrate`. The wrapped model may return any density over classes, also a mixture.
 
     A slope below 0 would reverse the order of the classes. If the labels contradict the wrapped model, the slope stops
-    at 0, and every prediction is then the share of each class. Slope and biases have upper bounds too. The log says if
-    a bound is reached.
+    at 0, and the predicted probability of a class is then its share of the validation labels, for every input. Slope
+    and biases have upper bounds too. The log says if a bound is reached.
 
     Args:
         smoothing: whether to fit to smoothed labels, as if there were one more sample of each class: (N₊+1)/(N₊+2) and
