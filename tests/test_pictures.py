@@ -262,7 +262,9 @@ def test_no_samples_at_all_still_make_a_figure(tmp_path: Path) -> None:
 
 
 def test_wrong_numbers_of_samples_and_nan_are_refused() -> None:
-    with pytest.raises(ValueError, match="1 densities, 1 samples in rows, 1 images and 2 captions"):
+    with pytest.raises(
+        ValueError, match="1 densities, 1 images and 2 captions, and the numbers in `rows` sum to 1"
+    ):
         circles([bumps((1, 0, 5))], captions=["one", "two"])
     with pytest.raises(ValueError, match="NaN"):
         circles([np.full(720, math.nan)])

@@ -102,7 +102,9 @@ class Density:
         """Return the density of number `index` of the target alone, with event (1,)."""
         if self.event == (1,) and index == 0:
             return self
-        raise ValueError(f"The density of one of the {self.event} numbers is not known.")
+        raise ValueError(
+            f"The density over a target of shape {self.event} has no known marginal density of one number."
+        )
 
     def cdf(self, value: Array) -> Array:
         """Return P(X ≤ value) of one real number, (*sample, *batch), at `value` (*sample, *batch, 1)."""

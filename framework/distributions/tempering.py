@@ -212,7 +212,7 @@ class CircularPower(Distribution):
             else:
                 raise UserError(
                     f"{type(density).__name__} at temperature {float(temperature.detach()):g} is too narrow for a grid "
-                    f"of {MOST_POINTS} angles (its mass is uncertain by {off.max().item():.2g} nats). Register "
+                    f"of {MOST_POINTS} angles (the log of its mass has an error of {off.max().item():.2g}). Register "
                     "its power with `framework.distributions.protocol.tempered_density.register`, or raise the "
                     "temperature's lower bound."
                 )

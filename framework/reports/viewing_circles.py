@@ -110,8 +110,8 @@ def viewing_circles(
     lengths = (log_density.shape[1], sum(rows.values()), len(images), len(captions))
     if len(set(lengths)) != 1:
         raise ValueError(
-            f"Got {lengths[0]} densities, {lengths[1]} samples in rows, {lengths[2]} images and {lengths[3]} "
-            "captions. Pass equally many of each."
+            f"Got {lengths[0]} densities, {lengths[2]} images and {lengths[3]} captions, and the numbers in `rows` sum "
+            f"to {lengths[1]}. Pass equally many densities, images and captions, and this number in `rows`."
         )
     density = np.exp(np.minimum(log_density.astype(np.float64), 700))  # larger exponents overflow float64
     if np.isnan(density).any():

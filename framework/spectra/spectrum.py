@@ -23,13 +23,13 @@ Preset = Literal["ten", "fifteen"]
 
 
 class Parameters(NamedTuple):
-    """The fitted parameters: names, box and start of the search, and the number of those that are the target.
+    """The fitted parameters of spectra: their names, bounds and start values, and how many of them are the target.
 
     Attributes:
         names: with units; amplitudes are shares of the unsaturated signal.
         lower: lower bounds.
         upper: upper bounds.
-        start: start of the search.
+        start: values at which the search starts.
         target_count: number of parameters that are the target; the parameters after them are fitted too.
     """
 

@@ -63,8 +63,8 @@ class Budget(TorchDispatchMode):
         self.allocated = [(storage, nbytes) for storage, nbytes in self.allocated if not storage.expired()]
         if size + sum(nbytes for _, nbytes in self.allocated) > self.most_bytes:
             raise self._refusal(
-                "the model takes far more memory than its weights and inputs explain (at last a tensor of "
-                f"{size / 1e6:.4g} MB)"
+                "the model takes far more memory than its weights and inputs explain (the refused tensor would "
+                f"take {size / 1e6:.4g} MB)"
             )
         result = func(*args, **keywords)
         for tensor in tree_iter(result):

@@ -392,7 +392,7 @@ def _against_differences(encoder: Encoder, inputs: Callable[[int], Tensor], wors
 
 
 def _extremes(encoder: Encoder, like: Tensor, worst: Worst) -> None:
-    """Check that features are finite for constant inputs, which for vectors are also tiny and large.
+    """Check that features are finite for constant inputs; vectors are also tried with tiny and large numbers.
 
     A sample of NaN must not affect other samples, or must be refused.
     """

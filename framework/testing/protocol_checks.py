@@ -109,7 +109,7 @@ def check_powers(density: Distribution, worst: Worst) -> None:
 
 
 def powers_of(density: Distribution, worst: Worst) -> Iterator[tuple[float, Distribution]]:
-    """Yield each of TEMPERATURES with the density tempered by it, as far as the density has powers."""
+    """Yield each of TEMPERATURES at which the density can be tempered, with the tempered density."""
     for temperature in TEMPERATURES:
         try:
             power = protocol.tempered_density(density, torch.tensor(temperature, dtype=torch.float64))

@@ -104,7 +104,9 @@ def _values(content: h5py.File, dataset: Any, most: int) -> np.ndarray:
             f"{dataset.chunks}; expected numbers or references, at most {most} in all and in a chunk"
         )
     if dataset.external or dataset.is_virtual or dataset.file.filename != content.filename:
-        raise ValueError("the values of a dataset lie in another file; expected all values in this file")
+        raise ValueError(
+            f"the values of {dataset.name} lie in another file; expected all values in this file"
+        )
     return dataset[()]
 
 

@@ -30,7 +30,9 @@ class Rotated(FetchedInBatches):
     def __getitems__(self, indices: Sequence[int]) -> dict[str, Tensor]:
         index = torch.as_tensor(indices)
         if ((index < 0) | (index >= len(self))).any():
-            raise IndexError(f"An index is out of range; expected indices from 0 to {len(self) - 1}.")
+            raise IndexError(
+                f"Got indices from {int(index.min())} to {int(index.max())}; expected 0 to {len(self) - 1}."
+            )
         batch = self.clouds.__getitems__((index % len(self.clouds)).tolist())
         matrix = self.matrices[index // len(self.clouds)]
         return {**batch, "input": _rotate(batch["input"], matrix), "index": index}

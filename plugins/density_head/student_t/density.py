@@ -212,9 +212,10 @@ def _(density: StudentT, temperature: Tensor) -> StudentT:
     freedom = (density.freedom + 1) / temperature - 1
     if not torch.compiler.is_exporting() and not bool((freedom > 2).all()):
         raise UserError(
-            f"A density of Student's t with {float(density.freedom.min()):.3g} degrees of freedom has no power with "
-            f"the temperature {float(temperature):.3g}: at most {float((density.freedom.min() + 1) / 3):.3g} leaves "
-            "it a variance. Leave the temperature out: this head calibrates its scale and degrees of freedom itself."
+            f"A density of Student's t with {float(density.freedom.min()):.3g} degrees of freedom cannot have the "
+            f"temperature {float(temperature):.3g}, because it has a variance only at temperatures below "
+            f"{float((density.freedom.min() + 1) / 3):.3g}. Leave the temperature out: this head calibrates its scale "
+            "and degrees of freedom itself."
         )
     scale = density.scale * (density.freedom / freedom).sqrt()
     return StudentT(density.location, scale.to(density.scale.dtype), freedom)

@@ -74,7 +74,7 @@ def test_targets_that_a_gaussian_excludes_cost_a_few_nats():
 
 
 def test_powers_without_a_variance_are_refused():
-    with pytest.raises(UserError, match="at most 2 leaves it a variance"):
+    with pytest.raises(UserError, match="has a variance only at temperatures below 2"):
         tempered_density(density_of(5.0), torch.tensor(3.0))
 
 

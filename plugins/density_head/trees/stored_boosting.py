@@ -33,7 +33,7 @@ def require_boosting(content: bytes, classes: int, numbers: int, features: int) 
     Args:
         content: UBJSON, as `xgboost.Booster.save_raw` writes it.
         classes: number of classes of the target; 0 for reals.
-        numbers: number of sums of trees: one for each class, or for each real number.
+        numbers: number of values that sums of trees predict: one for each class, or for each real number.
         features: number of features that the trees read.
 
     Raises:
@@ -88,8 +88,8 @@ def require_boosting(content: bytes, classes: int, numbers: int, features: int) 
     trees = forest["trees"]
     if not isinstance(trees, list) or not trees or len(trees) % numbers:
         raise ValueError(
-            f"the stored model has no list of trees whose number is a positive multiple of {numbers}, the number of "
-            "sums of trees"
+            f"the stored model has no list of trees, or the number of trees is not a positive multiple of {numbers}, "
+            "the number of classes or real numbers that the trees predict"
         )
     counted = {"num_parallel_tree": "1", "num_trees": str(len(trees))}
     _require_equal(forest["gbtree_model_param"], counted, "gbtree_model_param")

@@ -29,10 +29,10 @@ class UNet(Encoder):
         levels: number of levels.
         normalisation: "batch", by the moments of the batch; "renorm", by the moments of the batch, corrected towards
             the running moments; or "group", by the moments of each image's groups of channels. See `layers.Layer`.
-        colors: number of outputs that are colours, 0 to 1.
-        scales: number of further outputs, the logarithms of scales.
-        crop: margin, pixels, around the subject's box outside which evaluation computes nothing; None computes
-            everything.
+        colors: number of output channels that are colours, 0 to 1.
+        scales: number of further output channels: logarithms of the scales of a density of the colours.
+        crop: margin, pixels. Evaluation computes only the subject's bounding box and this margin around it; None: the
+            whole image.
         precision: precision of evaluation; "auto" is bfloat16 on processors with fast bfloat16 matrix products, else
             float32.
         residual: whether the network's output is added to the input's first `colors` channels, which are colours of a

@@ -116,8 +116,8 @@ def require_finite(raw: Float[Tensor, "batch sample *raw"]) -> Float[Tensor, "ba
     if len(bad):
         row, sample = bad[0].tolist()
         raise UserError(
-            f"uncertainty mc_dropout: the output of the network is not finite under {len(bad)} dropout masks, the "
-            f"first of them is sample {sample} of row {row} of the batch. Check this input, or train with a lower "
+            f"uncertainty mc_dropout: the output of the network is not finite under {len(bad)} dropout masks; "
+            f"the first is mask {sample} of the input in batch row {row}. Check this input, or train with a lower "
             "optimizer.learning_rate."
         )
     return raw

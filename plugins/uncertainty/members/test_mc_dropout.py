@@ -387,7 +387,7 @@ def test_numbers_that_are_not_finite_are_named_and_not_averaged_in(bad):
     inputs = torch.randn(3, 4)
     inputs[1, 2] = bad
     with pytest.raises(
-        UserError, match="not finite under 4 dropout masks, the first of them is sample 0 of row 1"
+        UserError, match="not finite under 4 dropout masks; the first is mask 0 of the input in batch row 1"
     ):
         mcd(inputs)
 
