@@ -116,7 +116,7 @@ class Density:
 
     def peaks(self) -> tuple[Array, Array]:
         """Return candidates for the mode of one number, (peak, *batch), and the width of the peak at each."""
-        raise ValueError("The peaks of this density are not known.")
+        raise ValueError("The mode candidates and peak widths of this density are not known.")
 
     def bound(self, value: Array) -> Bound:
         """Return a lower bound of the log-density that touches it at `value` (*sample, *batch, *event)."""

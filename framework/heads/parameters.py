@@ -76,7 +76,8 @@ def require_trained(component: DensityHead) -> DensityHead:
     fitted = set(component.state_dict()) - {name for name, _ in component.named_parameters()}
     if fitted:
         raise ConfigError(
-            f"density_head.component fits {', '.join(sorted(fitted))} after training, but a component cannot "
-            "be fitted then. Choose a component that predicts these parameters, such as concentration=predicted."
+            f"density_head.component fits {', '.join(sorted(fitted))} after training, but only the head "
+            "of a model can be fitted then. Choose a component that predicts these parameters, such as "
+            "concentration=predicted."
         )
     return component

@@ -116,7 +116,7 @@ def _pickles(file: BinaryIO) -> Iterator[bytes]:
         }
         if parts != records or len(archive.infolist()) != len(names) or "data.pkl" not in records:
             raise ValueError(
-                "the directory of the zip archive is ambiguous, or the archive contains no values"
+                "Python and torch find different parts in the zip archive, or the archive lacks the part data.pkl"
             )
     yield reader.get_record("data.pkl")
 
@@ -166,7 +166,7 @@ def require_dense(content: Any, size: int | float = math.inf) -> None:
             if bytes_left < 0:
                 raise ValueError("the tensors share storage, and have far more bytes in all than the file")
         elif isinstance(item, torch.UntypedStorage | torch.TypedStorage):
-            raise Foreign("the values contain a storage without a tensor")
+            raise Foreign("the file contains the storage of a tensor without the tensor")
         elif isinstance(item, dict | list | tuple | set) and id(item) not in visited:
             visited.add(id(item))
             inner = item.items() if isinstance(item, dict) else enumerate(item)

@@ -167,8 +167,8 @@ class XGBoostHead(DensityHead, Fitted):
             or bool(len(content)) != bool(size)
         ):
             raise ValueError(
-                "the stored `model` is not a row of bytes, or `read`, the number of features that the trees read, "
-                "does not fit; expected both empty or both set"
+                f"the stored `model` has the shape {content.shape}, and `read`, the number of features that the trees "
+                f"read, is {size.tolist()}; expected a row of bytes and a number from 1, or no bytes and 0"
             )
         if len(content):
             require_boosting(content.tobytes(), self.classes, self.numbers, int(size))

@@ -246,8 +246,8 @@ def resolve_beside(folder: Path, name: str) -> Path:
 def find_beside(folder: Path, name: str, content: str, notes: list[str]) -> Path | None:
     """Find a file that another file in `folder` refers to; return None and add a note if there is no such file.
 
-    Programs often write a path of their own machine. If the path lies outside of `folder`, the file of the same name in
-    `folder` is used.
+    Programs often write a path that exists only on the machine on which they ran. If the path lies outside of `folder`,
+    the file of the same name in `folder` is used.
 
     Args:
         folder: folder of the referring file.

@@ -44,7 +44,10 @@ class Chain(nn.Module):
         self._pools: dict[float, Tensor] = {}
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "member batch size"]:
-        """Return the outputs of all members for their own inputs, (member, batch, length), or for the same ones."""
+        """Return the outputs of all members.
+
+        `inputs` are (member, batch, length), or (batch, length) if all members read the same inputs.
+        """
         dtype = self.weights[0].dtype
         numbers = inputs.to(dtype) / 255 if inputs.dtype == torch.uint8 else inputs.to(dtype)
         numbers = numbers.expand(self.members, *inputs.shape) if inputs.dim() == 2 else numbers

@@ -52,7 +52,7 @@ class MCDropout(Uncertainty):
 
     Args:
         model: function that builds the wrapped model, which needs a dropout layer with a probability above 0.
-        samples: S, a knob; with 1 the density is that of one stochastic pass.
+        samples: S, which may be changed after training (a knob); 1 gives the density of one stochastic pass.
 
     Raises:
         ConfigError: the model has no such dropout layer, or `samples` was set below 1.

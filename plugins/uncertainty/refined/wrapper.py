@@ -29,7 +29,7 @@ class Refined(Uncertainty):
     the wrapped model.
 
     Attributes:
-        steps: largest number of steps of a fit (a knob).
+        steps: largest number of steps of a fit, which may be changed after training (a knob).
 
     Args:
         steps: initial value of the attribute.
