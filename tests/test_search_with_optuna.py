@@ -121,6 +121,16 @@ def test_what_a_killed_command_began_is_suggested_again(tmp_path: Path) -> None:
     assert [point.state.name for point in another.points()] == ["COMPLETE", "FAIL", *["COMPLETE"] * 3]
 
 
+def test_the_values_of_a_trial_that_was_taken_over_are_kept(tmp_path: Path) -> None:
+    first, second = study(tmp_path), study(tmp_path)
+    [overrides] = first.suggest(1, 1)
+    assert second.take_over()
+    tell(first, overrides)
+    assert second.suggest(1, 1) == []
+    assert not second.take_over()
+    assert [len(point.values) for point in second.points()] == [1]
+
+
 def test_a_small_space_is_run_whole_and_then_ends(tmp_path: Path) -> None:
     one = study(tmp_path, "x=1,2,2,3", "y=range(0,2)", "z=5", sampler="tpe")
     while suggested := one.suggest(4, 100):

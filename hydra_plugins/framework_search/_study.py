@@ -25,7 +25,7 @@ from optuna.samplers import BaseSampler, NSGAIISampler, QMCSampler, RandomSample
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.study import StudyDirection
-from optuna.trial import FrozenTrial, Trial, TrialState
+from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 
 from framework.errors import ConfigError, shorten
 from framework.runs.job import PRUNED
@@ -182,7 +182,7 @@ class Study:
         with self._reached(), hold_lock(self.folder / LOCK):
             for trial in self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
                 if self._is_here(trial) and not is_running(self._overrides(trial.params)):
-                    self._finish(trial.number, state=TrialState.FAIL)
+                    self._finish(trial.number, TrialState.FAIL)
             for point in self.points():
                 if point.state == TrialState.FAIL and point.is_own:
                     self._enqueue(point.params)
@@ -196,7 +196,7 @@ class Study:
             trials = self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
             running = [trial for trial in trials if self._is_here(trial)]
             for trial in running:
-                self._finish(trial.number, state=TrialState.FAIL)
+                self._finish(trial.number, TrialState.FAIL)
                 if set(trial.params) == set(self._distributions):
                     self._enqueue(trial.params)
         return bool(running)
@@ -275,9 +275,12 @@ class Study:
         trial = self._losses.pop(_key(overrides)).trial
         with self._reached():
             if values is not None and all(map(math.isfinite, values)):
-                self._finish(trial, list(values))
+                if not self._finish(trial.number, TrialState.COMPLETE, list(values)):
+                    self._study.add_trial(
+                        create_trial(values=values, params=trial.params, distributions=self._distributions)
+                    )
             else:
-                self._finish(trial, state=TrialState.PRUNED if pruned else TrialState.FAIL)
+                self._finish(trial.number, TrialState.PRUNED if pruned else TrialState.FAIL)
 
     def watch(self, job: Job) -> None:
         """Store the new validation losses of a running job, and ask it to stop if the pruner finds them too high."""
@@ -311,12 +314,12 @@ class Study:
             write_whole(job.folder / PRUNED, sentence.encode())
             log.info(f"#{job.number} is asked to stop after epoch {losses.epoch + 1}")
 
-    def _finish(
-        self, trial: Trial | int, values: Sequence[float] | None = None, state: TrialState | None = None
-    ) -> None:
-        """End a trial, unless another command, which took it over, has ended it."""
-        with suppress(optuna.exceptions.UpdateFinishedTrialError):
-            self._study.tell(trial, values, state, skip_if_finished=True)
+    def _finish(self, number: int, state: TrialState, values: Sequence[float] | None = None) -> bool:
+        """End a trial, and return whether it has this state now; another command may have ended it differently."""
+        try:
+            return self._study.tell(number, values, state, skip_if_finished=True).state == state
+        except optuna.exceptions.UpdateFinishedTrialError:  # it ended at this moment
+            return False
 
     def _enqueue(self, params: dict[str, Any]) -> None:
         self._study.enqueue_trial(params, user_attrs={FOLDER: self._home} if self._home else None)
