@@ -396,7 +396,8 @@ def test_a_metric_of_the_results_ranks_its_own_way(
     with pytest.raises(ConfigError, match=r"has no known direction\. Set hydra\.sweeper\.direction"):
         ranking.rank(tmp_path, given, [], ["odd"])
     with pytest.raises(
-        ConfigError, match=r"no trial has this number\. Did you mean 'accuracy'\? The trials have: accuracy, "
+        ConfigError,
+        match=r"no trial has a number of this name\. Did you mean 'accuracy'\? The trials have: accuracy, ",
     ):
         ranking.rank(tmp_path, given, [], ["acuracy"])
 

@@ -221,8 +221,8 @@ def page(results: dict[str, Any]) -> str:
             + ("equal" if results["same"] else "DIFFER FROM")
             + " those of the undisturbed sweep.",
             "",
-            f"Single files cost more. The next table holds the rates of one command for {FILES:,} files, from the "
-            "first to the last part of 100 clouds.",
+            f"Single files cost more. The next table holds the rates of one command for {FILES:,} files in parts of 100 "
+            "clouds, over the time from the end of the first part to the end of the last.",
             "",
             "| one cloud per file | share of the encoder's rate |",
             "|---|---:|",

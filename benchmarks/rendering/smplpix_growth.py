@@ -101,8 +101,8 @@ def report(figure_path: Path) -> str:
             "# Run time of an image against the vertices of its mesh",
             "",
             "This page measures how the run time of an image grows with the number of vertices of its mesh. It "
-            "compares rendering of the mesh with neural networks (SMPLpix) that draw the image from projected "
-            "vertices. The run time of the networks should depend less on the number of vertices.",
+            "compares a renderer that draws the mesh with neural networks (SMPLpix) that draw the image from "
+            "projected vertices. The run time of the networks should depend less on the number of vertices.",
             "",
             f"The rendered images have {SIZE[0]} × {SIZE[1]} pixels and show the default body with synthetic colours, "
             f"which covers {covered:.0%} of the pixels. All numbers except the last two columns are processor times "

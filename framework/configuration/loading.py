@@ -86,7 +86,7 @@ class User:
         self.frames = WeakTensorKeyDictionary()  # frames of the inputs of the calls in progress
 
     def convert_inputs(self, model: nn.Module, arguments: tuple[Any]) -> Tensor:
-        """Return the model's inputs for the user's data, and store their `Data.frame` for `convert_density`."""
+        """Return the model's inputs for a user's data, and store the result of `Data.frame` for `convert_density`."""
         batch = read_batch(model, self.data, *arguments)
         self.frames[batch["input"]] = self.data.frame(batch)
         return batch["input"]

@@ -111,7 +111,7 @@ def viewing_circles(
     if len(set(lengths)) != 1:
         raise ValueError(
             f"Got {lengths[0]} densities, {lengths[2]} images and {lengths[3]} captions, and the numbers in `rows` sum "
-            f"to {lengths[1]}. Pass equally many densities, images and captions, and this number in `rows`."
+            f"to {lengths[1]}. Pass equally many densities, images and captions, and rows whose sum is their number."
         )
     density = np.exp(np.minimum(log_density.astype(np.float64), 700))  # larger exponents overflow float64
     if np.isnan(density).any():

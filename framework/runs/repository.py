@@ -226,7 +226,7 @@ def _shared_indices(own: Path) -> Iterator[str]:
 
 
 class _Git:
-    """Program git, which is run in a temporary repository until the time limit.
+    """The program git, run in a temporary repository. It is stopped if it exceeds the time limit.
 
     Raises:
         OSError: git is not installed.

@@ -321,8 +321,8 @@ def _way(
     numbers = {key: None for result in results for key, value in result.items() if is_number(value)}
     if metric not in numbers:
         raise ConfigError(
-            f"hydra.sweeper.metric = {metric!r}: no trial has this number.{did_you_mean(metric, numbers)} The trials "
-            f"have: {', '.join(numbers)}; null stands for the {RETURNED}. {repeat}"
+            f"hydra.sweeper.metric = {metric!r}: no trial has a number of this name."
+            f"{did_you_mean(metric, numbers)} The trials have: {', '.join(numbers)}; null stands for the {RETURNED}. {repeat}"
         )
     ways: Better = {
         **COST_BETTER,

@@ -288,7 +288,9 @@ def _round_trip(
     inputs: Callable[[int], Tensor],
     worst: Worst,
 ) -> None:
-    """Check that an encoder with a stored state returns equal features, also after training changed its buffers."""
+    """Check that an encoder that loads a stored state returns the features of the encoder that stored it.
+
+    The state is stored before and after training, which may change buffers."""
     other = make(SEED + 7)  # so that a parameter that is not stored has another value
     batch = inputs(3)
     with torch.no_grad():

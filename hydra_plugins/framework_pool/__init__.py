@@ -372,7 +372,7 @@ def _without_hydra(config: DictConfig) -> DictConfig:
 
 
 def _plain_values(config: DictConfig, folder: Path) -> dict[str, Any]:
-    """Return a job's config as plain values, without Hydra's part; the folder in it is that of the sweep."""
+    """Return a job's config as plain values, without Hydra's own keys. Its run folder is the folder of the sweep."""
     with read_write(config), read_write(config.hydra), open_dict(config):
         config.hydra.runtime.output_dir = str(folder)
     before = HydraConfig.instance().cfg

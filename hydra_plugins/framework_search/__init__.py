@@ -269,8 +269,8 @@ class OptunaSearch(Search):
                 )
         if self.study is not None and self.storage is None:
             raise ConfigError(
-                "hydra.sweeper.study has no effect without hydra.sweeper.storage, because a folder has one study. "
-                "Leave it out."
+                "hydra.sweeper.study has no effect without hydra.sweeper.storage, because without a database the "
+                "folder of the sweep holds one study. Leave it out, or set hydra.sweeper.storage."
             )
         if self.pruner is not None and self.metrics != [None]:
             raise ConfigError(

@@ -90,7 +90,7 @@ def parse_space(overrides: Sequence[Override]) -> dict[str, Domain]:
 
 
 def overrides_of(values: Mapping[str, str]) -> list[str]:
-    """Return the overrides of a point of the space, whose values by key are written as in overrides."""
+    """Return the overrides of a point of the search space, given the text of each value by its key."""
     return [key if key.startswith("~") and not value else f"{key}={value}" for key, value in values.items()]
 
 

@@ -81,10 +81,10 @@ class Problem(NamedTuple):
 @compiled
 @no_type_check
 def worth_packing(size, packets):
-    """Return true if a cloud of `size` points is searched faster after it is packed, for `packets` packets.
+    """Return true if a cloud of `size` points is searched faster after it is packed, for `packets` packets of queries.
 
     As measured, packing a cloud costs as much as comparing it with three packets, and the search for a packet in a
-    packed cloud costs as much as comparing it with some hundred points.
+    packed cloud costs as much as comparing it with a few hundred points.
     """
     return packets > 3 and size * packets > 8192
 

@@ -51,7 +51,7 @@ class Reading:
     skip_unreadable: bool = False
 
     def crop(self, file: Path, split: str) -> Crop:
-        """Return the settings with which a whole image is read; an image of the test split is blurred."""
+        """Return the settings that read a whole image, without a box. They blur an image of the test split."""
         return Crop(file, None, 0.0, self.image_size, blur=self.test_blur if split == "test" else 0.0)
 
     def read_unlabelled(self, files: Sequence[Path]) -> Fields | Crops:

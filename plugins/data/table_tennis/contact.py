@@ -49,7 +49,7 @@ def contact_rates(
         spin: Spin of the ball, rad/s.
         up: Upward push per mass, m/s².
         constants: Constants of the ball and the table.
-        spring: The table.
+        spring: Table, which pushes the ball back like a spring.
     """
     along, across = slip(velocity, spin, constants.radius)
     share = constants.friction * up / (along * along + across * across + spring.grip**2) ** 0.5

@@ -175,9 +175,10 @@ class BallisticHead(DensityHead, Fitted):
         return torch.cat([observations.times, self._after(observations)], 1)
 
     def _carried(self, observations: ObservedFrames, estimate: Estimate) -> tuple[Tensor, Tensor]:
-        """Return the mean of the future positions, (flight, number), and a factor F of their covariance F Fᵀ.
+        """Return the mean of the future positions and a factor F of their covariance F Fᵀ.
 
-        F has the shape (flight, number, 9) and comes from the linearised flight.
+            The mean has the shape (flight, coordinate), with three coordinates for each frame. F has the shape
+        (flight, coordinate, 9) and comes from the linearised flight.
         """
         places, slopes = simulate_with_jacobian(estimate.state, self._whole(observations), self.constants)
         mean = places[:, -self.future :].flatten(1)

@@ -80,8 +80,9 @@ class Folds(Uncertainty, SelfTraining):
         super().__init__()
         if len(dropout) != len(weight_decay) or not dropout:
             raise ConfigError(
-                f"uncertainty.folds.dropout has {len(dropout)} and weight_decay {len(weight_decay)} numbers, but both "
-                "have one for each group, and there is at least one group. Give lists of the same length."
+                f"uncertainty.folds.dropout has {len(dropout)} and weight_decay {len(weight_decay)} numbers, "
+                "but each needs one number for each group of models, and at least one group is needed. Give two lists of "
+                "the same length."
             )
         self.knobs = {}
         self.folds = folds
