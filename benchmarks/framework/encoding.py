@@ -216,13 +216,13 @@ def page(results: dict[str, Any]) -> str:
             f"command without a sweep that encodes {PART} clouds takes {median_and_range(starts, 2)} s of processor "
             f"time and {median_and_range(start_wall, 2)} s of wall time, nearly all of it its start.",
             "",
-            f"The same sweep was killed five times (SIGKILL of the command), after which {', '.join(map(str, results['killed']))} of "
-            f"{CLOUDS // PART} parts existed, and then finished. The bytes of all {results['compared']} files "
+            "The same sweep was killed five times (SIGKILL of the command), after which "
+            f"{', '.join(map(str, results['killed']))} of {CLOUDS // PART} parts existed, and then finished. The bytes of all {results['compared']} files "
             + ("equal" if results["same"] else "DIFFER FROM")
             + " those of the undisturbed sweep.",
             "",
-            f"Single files cost more. The next table holds the rates of one command for {FILES:,} files in parts of 100 "
-            "clouds, over the time from the end of the first part to the end of the last.",
+            f"Single files cost more. The next table holds the rates of one command for {FILES:,} files in parts of "
+            "100 clouds, over the time from the end of the first part to the end of the last.",
             "",
             "| one cloud per file | share of the encoder's rate |",
             "|---|---:|",

@@ -322,7 +322,8 @@ def _way(
     if metric not in numbers:
         raise ConfigError(
             f"hydra.sweeper.metric = {metric!r}: no trial has a number of this name."
-            f"{did_you_mean(metric, numbers)} The trials have: {', '.join(numbers)}; null stands for the {RETURNED}. {repeat}"
+            f"{did_you_mean(metric, numbers)} The trials have: {', '.join(numbers)}; null stands for "
+            f"the {RETURNED}. {repeat}"
         )
     ways: Better = {
         **COST_BETTER,

@@ -290,7 +290,8 @@ def _round_trip(
 ) -> None:
     """Check that an encoder that loads a stored state returns the features of the encoder that stored it.
 
-    The state is stored before and after training, which may change buffers."""
+    The state is stored before and after training, which may change buffers.
+    """
     other = make(SEED + 7)  # so that a parameter that is not stored has another value
     batch = inputs(3)
     with torch.no_grad():

@@ -81,8 +81,8 @@ class Folds(Uncertainty, SelfTraining):
         if len(dropout) != len(weight_decay) or not dropout:
             raise ConfigError(
                 f"uncertainty.folds.dropout has {len(dropout)} and weight_decay {len(weight_decay)} numbers, "
-                "but each needs one number for each group of models, and at least one group is needed. Give two lists of "
-                "the same length."
+                "but each needs one number for each group of models, and at least one group is needed. Give two lists "
+                "of the same length."
             )
         self.knobs = {}
         self.folds = folds
