@@ -217,7 +217,8 @@ def page(results: dict[str, Any]) -> str:
             f"time and {median_and_range(start_wall, 2)} s of wall time, nearly all of it its start.",
             "",
             "The same sweep was killed five times (SIGKILL of the command), after which "
-            f"{', '.join(map(str, results['killed']))} of {CLOUDS // PART} parts existed, and then finished. The bytes of all {results['compared']} files "
+            f"{', '.join(map(str, results['killed']))} of {CLOUDS // PART} parts existed, and then "
+            f"finished. The bytes of all {results['compared']} files "
             + ("equal" if results["same"] else "DIFFER FROM")
             + " those of the undisturbed sweep.",
             "",
