@@ -28,7 +28,7 @@ WITHOUT_COLOURS = (
 """First cell of a run: ipykernel sets variables that make commands write colours and progress bars."""
 LIMIT = 300
 """Longest time of a cell, s."""
-MOST_LINES = 40
+MOST_LINES = 44
 """Largest number of lines of an output that a page shows; the lines in the middle are left out."""
 
 

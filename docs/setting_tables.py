@@ -299,12 +299,12 @@ def yaml_comments(text: str) -> dict[str, str]:
 def argument_texts(cls: type) -> dict[str, str]:
     """Return the meaning of the arguments and attributes that the docstring of a class describes."""
     texts: dict[str, str] = {}
-    docstring = griffe.Docstring(inspect.getdoc(cls) if cls.__doc__ else "")
+    docstring = griffe.Docstring((cls.__doc__ and inspect.getdoc(cls)) or "")
     for section in docstring.parse("google", warnings=False):
         if section.kind.value in ("parameters", "attributes"):
             for item in section.value:  # griffe reads the second of two attributes as the type of the first
                 names = f"{item.name} {item.annotation}" if item.name.endswith(",") else item.name
-                texts |= dict.fromkeys(names.split(", "), item.description)
+                texts |= dict.fromkeys(names.split(", "), str(item.description))
     return texts
 
 
@@ -314,4 +314,4 @@ def attribute_texts(model: type[BaseModel]) -> dict[str, str]:
         "settings", Path(inspect.getfile(model)), Path(inspect.getfile(model)).read_text("utf-8")
     )
     members = source[model.__name__].attributes
-    return {name: member.docstring.value for name, member in members.items() if member.docstring}
+    return {name: str(member.docstring.value) for name, member in members.items() if member.docstring}
