@@ -17,9 +17,9 @@ import sys
 import tempfile
 import time
 import uuid
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -193,6 +193,9 @@ class Kind:
         sweep: whether the command is a sweep.
         script: whether a script runs the command, as `thesis_tables.py` does.
         goes_on: whether the command itself must complete, and only the children of the killed process end.
+        outlives: whether the jobs go on when the command is killed, so that the next command takes them up again.
+        environment: further environment variables.
+        compare: function that returns the names of what differs between a run and the run without a kill.
     """
 
     name: str
@@ -202,10 +205,15 @@ class Kind:
     sweep: bool = False
     script: bool = False
     goes_on: bool = False
+    outlives: bool = False
+    environment: Mapping[str, str] = field(default_factory=dict)
+    compare: Callable[[Path, Path], list[str]] = differences
 
     def command(self, folder: Path) -> list[str]:
+        """Return the command of a run or sweep in `folder`, whose name replaces "{folder}" in the words."""
         where = f"hydra.{'sweep' if self.sweep else 'run'}.dir={folder}"
-        words = [sys.executable, "-P", "-m", "framework", *self.words, where]
+        words = (word.replace("{folder}", str(folder)) for word in self.words)
+        words = [sys.executable, "-P", "-m", "framework", *words, where]
         return [sys.executable, "-c", SCRIPT, *words] if self.script else words
 
 
@@ -244,16 +252,27 @@ def runs(kind: Kind, folder: Path) -> list[Path]:
     return sorted(path.parent for path in folder.glob("*/job.json")) if kind.sweep else [folder]
 
 
+def start(kind: Kind, run: Path) -> Command:
+    """Start the command of a run or sweep in the folder `run`; its output goes to the folder above."""
+    return Command(kind.command(run), run.parent, **{"PYTHONPATH": str(ROOT), **kind.environment})
+
+
 def killed(
     kind: Kind, folder: Path, whole: Path, duration: float, kills: int, draw: random.Random, tallies: dict[int, Tally]
-) -> None:  # fmt: skip
-    """Kill one run or sweep `kills` times, let it finish, and compare it with the run that was not killed."""
+) -> list[str]:  # fmt: skip
+    """Kill one run or sweep `kills` times, let it finish, and compare it with the run that was not killed.
+
+    Returns:
+        Names of what differs, and of runs that have not finished.
+    """
     folder.mkdir(parents=True)
     done: list[int] = []
+    command: Command | None = None
     while len(done) < kills:
         number = kind.numbers[sum(tally.kills for tally in tallies.values()) % len(kind.numbers)]
-        command = Command(kind.command(folder / "it"), folder, PYTHONPATH=str(ROOT))
-        deadline = time.monotonic() + draw.uniform(0.1, 0.9) * duration
+        share = draw.uniform(0.1, 0.9) if command is None else draw.uniform(0.05, 0.3)
+        deadline = time.monotonic() + share * duration
+        command = command or start(kind, folder / "it")
         while command.process.poll() is None and (
             time.monotonic() < deadline or not (victims := kind.choose(command))
         ):
@@ -261,40 +280,59 @@ def killed(
         if command.process.poll() is not None:
             if all(status(run) == "FINISHED" for run in runs(kind, folder / "it")):
                 break  # the command finished before the kill; earlier kills count
-            raise RuntimeError(f"{kind.name} ended by itself: {command.output}")
-        some = {one.number for one in command.alive() if one.parent == victims[0]} if kind.goes_on else None
+            if not (kind.goes_on and done):
+                raise RuntimeError(f"{kind.name} ended by itself: {command.output}")
+            command = None
+            continue
+        victim = draw.choice(victims)
+        some = {victim, *(process.number for process in command.alive() if process.parent == victim)}
         with suppress(ProcessLookupError):
-            os.kill(victims[0], number)
+            os.kill(victim, number)
         tally = tallies.setdefault(number, Tally())
-        seconds = command.seconds_until_gone(3 * ALLOWED, some)
-        if kind.goes_on:
-            command.process.wait(timeout=20 * duration)
         tally.kills += 1
+        done.append(number)
+        if kind.outlives:
+            command.process.wait()
+            command = None
+            continue
+        seconds = command.seconds_until_gone(3 * ALLOWED, some if kind.goes_on else None)
         tally.ended += seconds <= ALLOWED
         tally.slowest = max(tally.slowest, seconds)
-        tally.closed += all(status(run) != "RUNNING" for run in runs(kind, folder / "it"))
-        done.append(number)
-    last = Command(kind.command(folder / "it"), folder, PYTHONPATH=str(ROOT))
-    last.process.wait(timeout=20 * duration)
-    found = [
+        if not kind.goes_on:
+            tally.closed += all(status(run) != "RUNNING" for run in runs(kind, folder / "it"))
+            command = None
+    if kind.goes_on and command is not None:
+        command.process.wait(timeout=20 * duration)
+        closed = all(status(run) != "RUNNING" for run in runs(kind, folder / "it"))
+        for number in done:
+            tallies[number].closed += closed
+    start(kind, folder / "it").process.wait(timeout=20 * duration)
+    wanted = [run.relative_to(whole) for run in runs(kind, whole)]
+    faults = [
         difference
-        for run in runs(kind, folder / "it")
-        for difference in differences(run, whole / run.relative_to(folder / "it"))
+        for name in wanted
+        for difference in (
+            kind.compare(folder / "it" / name, whole / name)
+            if status(folder / "it" / name) == "FINISHED"
+            else [f"the status {status(folder / 'it' / name)} of {name}"]
+        )
     ]
-    right = not found and all(status(run) == "FINISHED" for run in runs(kind, folder / "it"))
+    if (count := len(runs(kind, folder / "it"))) != len(wanted):
+        faults.append(f"{count} jobs, not {len(wanted)}")
     for number in done:
-        tallies[number].same += right
-    if not right:
-        sys.stderr.write(f"{kind.name}: {folder} differs: {found[:5]}\n")
+        tallies[number].same += not faults
+    if faults:
+        sys.stderr.write(f"{kind.name}: {folder} differs: {faults[:5]}\n")
+    return faults
 
 
 def measure(kind: Kind, kills: int, draw: random.Random, base: Path) -> list[str]:
     """Kill commands of one kind, and return the lines of the page."""
     whole = base / "whole" / "it"
     whole.parent.mkdir(parents=True)
-    start = time.monotonic()
-    code = Command(kind.command(whole), whole.parent, PYTHONPATH=str(ROOT)).process.wait(timeout=600)
-    duration = time.monotonic() - start
+    began = time.monotonic()
+    code = start(kind, whole).process.wait(timeout=600)
+    duration = time.monotonic() - began
     if code:
         raise RuntimeError(f"{kind.name} failed: {whole.parent / 'output.txt'}")
     tallies: dict[int, Tally] = {}

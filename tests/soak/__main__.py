@@ -1,0 +1,312 @@
+"""Kill training, calibration, tests, encoding, predictions and sweeps at random moments, and compare their results.
+
+    python -m tests.soak 200 --folder /tmp/soak [--minutes 4.5] [--only encoding]
+
+The test kills a command up to eight times, lets it finish, and compares what it has written, to the last bit, with the
+same command without a kill (`tests.fuzz.kills`). SLURM is included if its programs are on PATH. The folder keeps the
+counts, so that the command can be stopped and repeated. When all kills are made, the script writes soak.md into
+benchmarks/framework.
+"""
+
+import argparse
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from benchmarks.pages import machine, write_page
+from framework.storage.files import hold_lock
+from tests.fuzz.kills import ALLOWED, MARK, ROOT, RUN, Kind, Tally, killed, start
+from tests.slurm_cluster import SlurmCluster, missing_programs
+from tests.soak.events import EVENTS
+from tests.soak.kinds import Soaked, all_kinds, prepare
+
+LEFT = 60.0
+"""Seconds that must be left of --minutes for another command to start."""
+IN_A_ROW = 8
+"""Largest number of kills of one run or sweep."""
+TIMES = 3
+"""Number of repetitions of each event among 200 kills."""
+
+
+EVENT_ROWS = (
+    "Three events are more than one killed command. *Two sweeps* share a folder and a job; the first is killed and "
+    "repeated, and every job must exist once and equal an undisturbed one. *The store and the run*: the server of the "
+    "store is killed, then the run; the run is resumed, the server starts again, and every number of the journal must "
+    "be in the store once. The script that makes the thesis's tables is killed while it runs a sweep, and none of its "
+    "processes may be left 10 s later.",
+    "",
+    "| event | repetitions | kills | with a fault |",
+    "|---|---:|---:|---:|",
+)
+"""Text and head of the table of events on the page."""
+
+
+@dataclass
+class State:
+    """Counts of a soak test, which are kept in its folder.
+
+    Attributes:
+        tallies: Counts by kind and number of the signal.
+        durations: Seconds of each command without a kill.
+        events: Number of repetitions, of kills and of faults of each event.
+        attempts: Number of commands that were killed, by kind.
+        faults: What was lost or different.
+    """
+
+    path: Path
+    tallies: dict[str, dict[int, Tally]] = field(default_factory=dict)
+    durations: dict[str, float] = field(default_factory=dict)
+    events: dict[str, list[int]] = field(default_factory=dict)
+    attempts: dict[str, int] = field(default_factory=dict)
+    faults: list[str] = field(default_factory=list)
+
+    @classmethod
+    def load(cls, path: Path) -> "State":
+        """Return the state in a file, or an empty one."""
+        if not path.is_file():
+            return cls(path)
+        values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        tallies = {
+            name: {int(number): Tally(**tally) for number, tally in by_signal.items()}
+            for name, by_signal in values.pop("tallies").items()
+        }
+        return cls(path, tallies, **values)
+
+    def save(self) -> None:
+        """Write the state to its file."""
+        values = {key: value for key, value in asdict(self).items() if key != "path"}
+        self.path.write_text(json.dumps(values, indent=1), encoding="utf-8")
+
+    def kills(self, name: str) -> int:
+        """Return the number of kills of one kind."""
+        return sum(tally.kills for tally in self.tallies.get(name, {}).values())
+
+    @property
+    def total(self) -> int:
+        """Return the number of all kills."""
+        return sum(map(self.kills, self.tallies)) + sum(kills for _, kills, _ in self.events.values())
+
+
+class Soak:
+    """Soak test whose state is in a folder.
+
+    Args:
+        folder: Folder for the state, the inputs, and the runs of commands that are not killed.
+        count: Number of kills.
+        seed: Seed of the moments of the kills.
+    """
+
+    def __init__(self, folder: Path, count: int, seed: int = 0) -> None:
+        self.folder = folder
+        self.count = count
+        self.seed = seed
+        folder.mkdir(parents=True, exist_ok=True)
+        self.state = State.load(folder / "state.json")
+        if not (folder / "inputs").is_dir():
+            partial = folder / "inputs.partial"
+            shutil.rmtree(partial, ignore_errors=True)
+            partial.mkdir()
+            prepare(partial)
+            partial.rename(folder / "inputs")
+
+    def kill(self, soaked: Soaked, most: int = IN_A_ROW) -> list[str]:
+        """Kill a command a few times, and return what differs from the same command without a kill."""
+        kind, name = soaked.kind, soaked.kind.name
+        whole = self.whole(kind)
+        number = self.state.attempts[name] = self.state.attempts.get(name, 0) + 1
+        tallies = self.state.tallies.setdefault(name, {})
+        draw = random.Random(f"{self.seed} {name} {number}")
+        folder = self.folder / "runs" / f"{_slug(name)}-{number}"
+        before = self.state.kills(name)
+        faults = killed(kind, folder, whole, self.state.durations[name], most, draw, tallies)
+        if self.state.kills(name) < before + most:  # it finished before a kill
+            self.state.durations[name] *= 0.7
+        self._note(name, number, faults, folder)
+        return faults
+
+    def happen(self, name: str) -> list[str]:
+        """Let an event happen once, and return what was lost or differs."""
+        reference = Kind("event: one run", RUN, lambda command: [])
+        if EVENTS[name].__name__ == "two_sweeps":
+            words = ("-m", *RUN, "seed=0,1,2", "hydra.launcher.fork=true")
+            reference = Kind("event: one sweep", words, lambda command: [], sweep=True)
+        whole = self.whole(reference)
+        repetitions, kills, bad = self.state.events.get(name, [0, 0, 0])
+        folder = self.folder / "runs" / f"{_slug(name)}-{repetitions}"
+        draw = random.Random(f"{self.seed} {name} {repetitions}")
+        kill_count, faults = EVENTS[name](folder, whole, draw, self.state.durations[reference.name])
+        self.state.events[name] = [repetitions + 1, kills + kill_count, bad + bool(faults)]
+        self._note(name, repetitions, faults, folder)
+        return faults
+
+    def whole(self, kind: Kind) -> Path:
+        """Return the folder of the command's run without a kill, which is made at the first call."""
+        whole = self.folder / "whole" / _slug(kind.name) / "it"
+        if kind.name not in self.state.durations:
+            shutil.rmtree(whole.parent, ignore_errors=True)
+            whole.parent.mkdir(parents=True)
+            began = time.monotonic()
+            command = start(kind, whole)
+            if command.process.wait(timeout=600):
+                raise RuntimeError(f"{kind.name} failed: {command.output}")
+            self.state.durations[kind.name] = time.monotonic() - began
+            self.state.save()
+        return whole
+
+    def _note(self, name: str, number: int, faults: list[str], folder: Path) -> None:
+        self.state.faults += [f"{name} {number}: {fault}" for fault in faults[:5]]
+        self.state.save()
+        if not faults:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def run(self, kinds: list[Soaked], events: list[str], deadline: float) -> bool:
+        """Kill until every kind has its share, or until `deadline` (`time.monotonic`); return whether all is done."""
+        wanted = {soaked.kind.name: -(-soaked.weight * self.count // 200) for soaked in kinds}
+        repetitions = -(-TIMES * self.count // 200)
+        broken = set[str]()
+        while time.monotonic() < deadline - LEFT:
+            left = {
+                soaked.kind.name: soaked
+                for soaked in kinds
+                if self.state.kills(soaked.kind.name) < wanted[soaked.kind.name]
+            }
+            due = [name for name in events if self.state.events.get(name, [0])[0] < repetitions]
+            names = [name for name in (*left, *due) if name not in broken]
+            if not names:
+                return not (left or due)
+            shares = {name: self.state.kills(name) / wanted[name] for name in left}
+            shares |= {name: self.state.events.get(name, [0])[0] / repetitions for name in due}
+            name = min(names, key=shares.__getitem__)
+            try:
+                if name in left:
+                    faults = self.kill(left[name], min(IN_A_ROW, wanted[name] - self.state.kills(name)))
+                else:
+                    faults = self.happen(name)
+            except (RuntimeError, ValueError, OSError, subprocess.SubprocessError) as error:
+                broken.add(name)
+                end_all(self.folder)
+                faults = [f"{type(error).__name__}: {error}"]
+                self._note(name, -1, faults, self.folder)
+            sys.stdout.write(f"{self.state.total} kills; {name}: {faults or 'equal'}\n")
+            sys.stdout.flush()
+        return False
+
+
+def end_all(folder: Path) -> None:
+    """Kill the processes of commands that work in a folder, after one of them has failed."""
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # the process has ended
+            ours = f"{MARK}=".encode() in (process / "environ").read_bytes()
+            if ours and (process / "cwd").readlink().is_relative_to(folder):
+                os.kill(int(process.name), signal.SIGKILL)
+
+
+def _slug(name: str) -> str:
+    return "".join(letter if letter.isalnum() else "-" for letter in name)
+
+
+@contextmanager
+def slurm_cluster() -> Iterator[SlurmCluster | None]:
+    """Run SLURM on this machine during the block, if its programs are on PATH."""
+    if missing_programs():
+        yield None
+        return
+    with tempfile.TemporaryDirectory(prefix="slurm") as folder:  # a short path, because it holds sockets
+        cluster = SlurmCluster(Path(folder))
+        try:
+            yield cluster
+        finally:
+            cluster.close()
+
+
+def page(soak: Soak, kinds: list[Soaked]) -> str:
+    """Return the page of a soak test."""
+    state = soak.state
+    rows = []
+    for soaked in kinds:
+        for number, tally in sorted(state.tallies.get(soaked.kind.name, {}).items()):
+            ended = "they go on" if soaked.kind.outlives else f"{tally.ended} ({tally.slowest:.1f} s)"
+            closed = "–" if soaked.kind.outlives else str(tally.closed)
+            rows.append(
+                f"| {soaked.kind.name} | {signal.Signals(number).name} | {tally.kills} | {ended} | {closed} | "
+                f"{tally.same} |"
+            )
+    events = [
+        f"| {name} | {repetitions} | {kills} | {bad} |"
+        for name, (repetitions, kills, bad) in state.events.items()
+    ]
+    missing = [soaked.kind.name for soaked in kinds if not state.kills(soaked.kind.name)]
+    missing += [name for name in EVENTS if name not in state.events]
+    if not any(soaked.engine == "slurm" for soaked in kinds):
+        missing.append("sweeps on SLURM, whose programs were not on PATH")
+    return "\n".join(
+        [
+            "# Soak test",
+            "",
+            f"The test has killed {state.total} commands or processes of commands at random moments. Command: "
+            f"`python -m tests.soak {soak.count} --folder <folder>`, repeated until all kills are made. After at most "
+            "eight kills, the command is repeated and finishes.",
+            "",
+            f"Not killed yet: {'; '.join(missing) or 'none'}.",
+            "",
+            f"- *all ended*: no process of the command was alive {ALLOWED:.0f} s after the kill; the longest time is "
+            "in brackets. If a job, a fork server or a worker is killed, the command goes on and starts the job "
+            "again. Jobs on SLURM go on without their launcher, and the next command takes them up again.",
+            "- *closed*: afterwards, no `run.json` has the status RUNNING.",
+            "- *equal*: after the command was repeated, weights, journal, results, predictions and features equal "
+            "those of the same command without a kill, to the last bit; costs are not compared.",
+            "- *the clock goes back*: Python's clock is one hour back at each start of a process, and one more hour "
+            "every 2 s.",
+            "",
+            "| killed | signal | kills | all ended | closed | equal |",
+            "|---|---|---:|---:|---:|---:|",
+            *rows,
+            "",
+            *([*EVENT_ROWS, *events, ""] if events else ()),
+            f"Faults: {'; '.join(state.faults) or 'none'}.",
+            "",
+            machine("torch", "pytorch-lightning", "hydra-core", "mlflow", "ray"),
+            "",
+        ]
+    )
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    arguments.add_argument("count", type=int, help="number of kills")
+    arguments.add_argument("--folder", type=Path, required=True, help="folder of the state and the runs")
+    arguments.add_argument("--minutes", type=float, default=1e6, help="time after which the test stops")
+    arguments.add_argument(
+        "--only", default="", help="kill only commands whose name contains this regular expression"
+    )
+    arguments.add_argument("--seed", type=int, default=0)
+    arguments.add_argument("--page", action="store_true", help="write the page before all kills are made")
+    options = arguments.parse_args()
+    deadline = time.monotonic() + 60 * options.minutes
+    os.environ.setdefault("FRAMEWORK_CACHE", str(options.folder.absolute() / "cache"))
+    options.folder.mkdir(parents=True, exist_ok=True)
+    with hold_lock(options.folder / ".lock"), slurm_cluster() as slurm:
+        soak = Soak(options.folder.absolute(), options.count, options.seed)
+        kinds = all_kinds(soak.folder / "inputs", slurm)
+        chosen = [soaked for soaked in kinds if re.search(options.only, soaked.kind.name)]
+        complete = soak.run(chosen, [name for name in EVENTS if re.search(options.only, name)], deadline)
+    if options.page or (complete and len(chosen) == len(kinds)):
+        write_page(ROOT / "benchmarks/framework/soak", page(soak, kinds))
+
+
+if __name__ == "__main__":
+    main()
