@@ -130,6 +130,13 @@ def test_from_the_command_line(framework: Framework, root: Path, tmp_path: Path)
         "1 parts written, 0 of this job's 1 parts existed already; 2 of all 3 parts are missing in features"
         in done.out
     )
+    lines = done.out.splitlines()
+    begin = next(number for number, line in enumerate(lines) if line.startswith("threads: "))
+    assert lines[begin + 1 : begin + 3] == [
+        f"reads 11 files in {root} as point_cloud_folder",
+        "encodes them by bps, and writes 1 of 3 parts, with up to 4 samples each, to features",
+    ]
+    assert "first inputs: shape 40×3 each, features: shape 20" in lines[begin + 3 :]
     assert np.load(tmp_path / "features" / "part-000001.npy").shape == (4, 20)
     described = json.loads((tmp_path / "features" / "encoding.json").read_text())
     assert described["encoder"][0]["points"] == 20 and described["files"] == 11

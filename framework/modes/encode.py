@@ -24,6 +24,7 @@ from framework.datasets.shards import INDEX, Shards, is_folder_of_shards, open_s
 from framework.encoder import Encoder
 from framework.errors import ConfigError, DataError, quote
 from framework.geometry.clouds import pad
+from framework.runs.introduction import introduce_threads, print_lines
 from framework.runs.job import refuse_idle
 from framework.runs.run import open_run
 from framework.runs.session import record_citations, set_up_process
@@ -32,7 +33,7 @@ from framework.storage.enclosed import require_enclosed
 from framework.storage.files import remove_leftovers, replacing, write_whole
 from framework.storage.names import spell_name
 from framework.storage.plain_values import read_json
-from framework.storage.progress import Work
+from framework.storage.progress import Work, output
 from framework.training.batches import Batches
 
 DESCRIPTION, NAMES = INDEX, "files.txt"
@@ -175,6 +176,8 @@ def run(config: Config) -> None:
     else:
         collection = Collection(shards, into)
     part_numbers = parts_of_job(collection.parts, options.share)
+    introduce_threads(config.settings.threads, console)
+    print_lines(describe_work(collection, parts, len(part_numbers)), console)
     with open_run(config) as run:
         record_citations(run, {key: part for key, part in parts.items() if part})
         describe(collection, parts)
@@ -197,6 +200,19 @@ def run(config: Config) -> None:
             f"already; {missing} of all {collection.parts} parts are missing in {collection.into}",
             soft_wrap=True,
         )
+
+
+def describe_work(collection: Collection, parts: Mapping[str, Any], count: int) -> list[str]:
+    """Return the lines about the samples that are read, the encoders, and the `count` parts that this job writes."""
+    source = collection.source
+    if isinstance(source, Files):
+        reads = f"reads {source.samples} files in {source.root} as {parts['data']['name']}"
+    else:
+        reads = f"reads {source.samples} samples in the shards of {source.folder}"
+    names = ", ".join(part["name"] for part in parts["encoder"])
+    task = f"encodes them by {names}" if names else "packs them into shards"
+    of_job = f"{count} of {collection.parts} parts, with up to {source.part} samples each"
+    return [reads, f"{task}, and writes {of_job}, to {collection.into}"]
 
 
 def data_of(shards: Shards, config: Config) -> Mapping[str, Any] | None:
@@ -350,6 +366,10 @@ def encode(
             for features in source.batches(number, batch_size):
                 if config["encoder"] and not encoders:
                     encoders = build_encoders(config["encoder"], tuple(features.shape[1:]), source.columns)
+                    shapes = (
+                        "×".join(map(str, shape)) for shape in (features.shape[1:], encoders[-1].output_shape)
+                    )
+                    print_lines(["first inputs: shape {} each, features: shape {}".format(*shapes)], output())
                 for encoder in encoders:
                     features = encoder(features)
                 part_features.append(features)

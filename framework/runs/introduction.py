@@ -20,7 +20,7 @@ BUSY = 1.0
 
 def introduce(data: Data, console: Console) -> None:
     """Print the inputs, the target, the numbers of samples and the remarks of prepared data."""
-    _print_lines(lines(data), console)
+    print_lines(lines(data), console)
 
 
 def introduce_threads(chosen: int | None, console: Console) -> None:
@@ -33,7 +33,7 @@ def introduce_threads(chosen: int | None, console: Console) -> None:
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     cores = Cores(allowed, os.cpu_count() or allowed, load)
-    _print_lines([threads_line(torch.get_num_threads(), chosen, cores, os.environ)], console)
+    print_lines([threads_line(torch.get_num_threads(), chosen, cores, os.environ)], console)
 
 
 def introduce_model(description: Description, method: str, data: Data | None, console: Console) -> None:
@@ -50,7 +50,7 @@ def introduce_model(description: Description, method: str, data: Data | None, co
         f"model: {shorten(method)}, trained on {trained_on}",
         f"predicts {describe_target(description.target)}",
     ]
-    _print_lines([*heading, *([] if data is None else _samples(data)), *description.remarks], console)
+    print_lines([*heading, *([] if data is None else _samples(data)), *description.remarks], console)
 
 
 def lines(data: Data) -> list[str]:
@@ -119,7 +119,8 @@ def _samples(data: Data) -> list[str]:
     return [f"samples: {', '.join(sizes)}{skipped}", *(shorten(remark, 1000) for remark in data.remarks)]
 
 
-def _print_lines(texts: Sequence[str], console: Console) -> None:
+def print_lines(texts: Sequence[str], console: Console) -> None:
+    """Print texts, one line each, without wrapping and without markup."""
     for line in texts:
         console.print(line, soft_wrap=True, highlight=False, markup=False)
 
