@@ -131,6 +131,7 @@ mode=predict mode.file=x | Did you mean 'files'?
 mode=predict mode.files=nowhere | Give a file, or a folder of files
 mode=combine | mode.members is missing
 mode=combine mode.members=nowhere | at least two are required
+mode=combine mode.members=nowhere uncertainty=[ensemble] | uncertainty=ensemble needs several models
 mode=encode mode.files=a mode.into=b | data.name is missing
 mode=sync mode.run=nowhere | is no run folder
 mode=check | needs a plugin, but none is chosen

@@ -21,8 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from framework.configuration.composition import folder, register
 from framework.errors import ConfigError
-from framework.modes.combine import find_members
-from framework.runs.job import find_job_folders
+from framework.runs.job import find_job_folders, find_members
 from framework.sweeps import comparison, ranking
 from hydra_plugins.framework_search import _best, _draws, _space
 from tests.conftest import TINY, Framework, imported_by

@@ -28,6 +28,8 @@ from framework.configuration.description import Description
 from framework.configuration.loading import PREFIX, load
 from framework.configuration.settings import Settings
 from framework.errors import CheckpointError, ConfigError, DataError, UserError
+from framework.storage import checkpoints
+from framework.sweeps.comparison import experiment_of
 from framework.tracking import sender, store_process
 from framework.tracking import tracker as tracking
 from framework.tracking.ended import mark_dead, sync
@@ -1443,6 +1445,33 @@ def test_a_runs_model_is_one_of_mlflow_that_answers_raw_rows(
     shutil.move(folder, tmp_path / "moved")
     copy = run_folder(run.info.run_id, default_uri(folder))
     assert load(copy)(rows).mode.equal(density.mode)
+
+
+@pytest.mark.parametrize(("name", "expected"), [(None, "tabular"), ("tables/gaussian", "tables")])
+def test_a_sweep_over_stored_models_is_in_the_experiment_of_its_jobs(
+    trained: tuple[Path, DataFrame], tmp_path: Path, name: str | None, expected: str
+) -> None:
+    content = checkpoints.read(trained[0])
+    content["framework"]["settings"]["experiment_name"] = name
+    folders = [tmp_path / number for number in "01"]
+    for run in folders:
+        (run / "checkpoints").mkdir(parents=True)
+        checkpoints.write(content, run / "checkpoints" / "model.ckpt")
+    model = {"checkpoint": str(folders[0])}
+    chosen = {"data": {"name": "moons"}}
+    for config, experiment in (
+        ({"mode": {"name": "test"}, **model}, expected),
+        ({"mode": {"name": "predict"}, **model, "experiment_name": "mine/run"}, "mine"),
+        ({"mode": {"name": "test"}, **model, "logger": {"experiment": "mine"}}, "mine"),
+        ({"mode": {"name": "combine", "members": str(tmp_path)}}, expected),
+        ({"mode": {"name": "combine", "members": [str(run) for run in folders]}}, expected),
+        (
+            {"mode": {"name": "train"}, **model, **chosen},
+            "moons",
+        ),  # its experiment is not that of the weights
+        ({"mode": {"name": "test"}, "checkpoint": "nowhere", **chosen}, "moons"),  # the jobs report the error
+    ):
+        assert experiment_of(config) == experiment, config
 
 
 def test_a_run_without_checkpoints_is_said(folder: Path) -> None:

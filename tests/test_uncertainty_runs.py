@@ -16,7 +16,8 @@ from framework.configuration.schema import build, resolve
 from framework.configuration.settings import Settings
 from framework.distributions.density import Mixture
 from framework.errors import CheckpointError, ConfigError, DataError
-from framework.modes.combine import common_description, find_members, wrapper_config
+from framework.modes.combine import common_description, wrapper_config
+from framework.runs.job import find_members
 from framework.target import Target
 from tests.conftest import Done, Framework
 

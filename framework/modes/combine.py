@@ -1,8 +1,7 @@
 """mode=combine: join separately trained models as the members of one wrapper, calibrate it and test it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -18,13 +17,10 @@ from framework.data import Data
 from framework.errors import CheckpointError, ConfigError
 from framework.model import FrozenFrontEnd, Predictor
 from framework.reports.report import report_test
-from framework.runs.job import find_job_folders, natural_order_key
+from framework.runs.job import find_members
 from framework.runs.run import open_run
 from framework.runs.session import add_test_parts, calibrate, for_predictor, set_up_process
-from framework.storage.enclosed import require_enclosed
-from framework.uncertainty import Joining
-
-_MODEL = "checkpoints/model.ckpt"
+from framework.uncertainty import Joining, SelfTraining, SeveralModels
 
 
 class CombineOptions(Options):
@@ -38,6 +34,7 @@ def run(config: Config) -> None:
     """Join the members, write checkpoints/model.ckpt for the other modes, test the model and print its table row."""
     options = config.options(CombineOptions)
     console = set_up_process(config.settings)
+    around = outer_wrappers(config.settings.uncertainty or {})
     sources = find_members(options.members)
     repeated_paths = flatten(config.settings.stored)
     members = [
@@ -45,13 +42,7 @@ def run(config: Config) -> None:
         for source in sources
     ]
     shared = common_description([description for _, description in members])
-    wrappers = [
-        wrapper_config(options.wrapper, len(members)),
-        *(
-            resolve("uncertainty", part, f"uncertainty.{key}")
-            for key, part in (config.settings.uncertainty or {}).items()
-        ),
-    ]
+    wrappers = [wrapper_config(options.wrapper, len(members)), *around]
     parts = {**shared.config, "uncertainty": [*shared.config["uncertainty"], *wrappers]}
     method = " + ".join([shared.method, *(part["name"] for part in wrappers)]) if shared.method else ""
     session = add_test_parts(
@@ -64,31 +55,6 @@ def run(config: Config) -> None:
         session.save_model(run)
         console.print(f"{len(members)} members: {', '.join(map(str, sources))}", soft_wrap=True)
         report_test(run, session)
-
-
-def find_members(members: str | Sequence[str]) -> list[str | Path]:
-    """Return the run folders, checkpoint files or MLflow run ids of the members.
-
-    If `members` is a folder, the members are the runs directly in it that contain a trained model, sorted by name. If
-    the folder contains no such run, the members are the jobs with a trained model at any depth.
-
-    Raises:
-        ConfigError: There are fewer than two members.
-    """
-    if not isinstance(members, str):
-        listed: list[str | Path] = list(members)
-    else:
-        folder = Path(members).expanduser()
-        require_enclosed(folder, ConfigError)
-        runs = sorted((path.parent.parent for path in folder.glob(f"*/{_MODEL}")), key=natural_order_key)
-        listed = [*(runs or (job for job in find_job_folders(folder) if (job / _MODEL).is_file()))]
-    if len(listed) < 2:
-        raise ConfigError(
-            f"mode.members = {members!r} names {len(listed)} trained model{'' if len(listed) == 1 else 's'}, but at "
-            "least two are required. Give the folder of a sweep (outputs/sweeps/<time>), or a list of run folders, "
-            "checkpoint files or MLflow run ids."
-        )
-    return listed
 
 
 def common_description(members: Sequence[Description]) -> Description:
@@ -140,6 +106,23 @@ def wrapper_config(wrapper: str, count: int) -> dict[str, Any]:
             "framework.uncertainty.Joining."
         )
     return resolve("uncertainty", {"name": wrapper, **kind.parameters_of(count)}, "mode.wrapper")
+
+
+def outer_wrappers(wrappers: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the resolved configs of the wrappers that `uncertainty` puts around the joined model, innermost first.
+
+    Raises:
+        ConfigError: One of them needs several models, but there is only one joined model.
+    """
+    resolved = [resolve("uncertainty", part, f"uncertainty.{key}") for key, part in wrappers.items()]
+    for part in resolved:
+        if issubclass(load("uncertainty", part["name"]), (SeveralModels, SelfTraining, Joining)):
+            raise ConfigError(
+                f"uncertainty={part['name']} needs several models, but in mode=combine the wrappers of uncertainty are "
+                f"put around the one model that mode.wrapper joins. Leave uncertainty={part['name']} out; "
+                "mode.wrapper chooses the wrapper that joins the members."
+            )
+    return resolved
 
 
 def build_joined(config: dict[str, Any], data: Data, members: Sequence[Predictor]) -> Predictor:

@@ -3,10 +3,12 @@
 import json
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from framework.errors import ConfigError, DataError, quote
+from framework.storage.enclosed import require_enclosed
 from framework.storage.files import write_whole
 from framework.storage.first_rank import first_rank
 from framework.storage.plain_values import read_json
@@ -21,6 +23,7 @@ PRUNED = "pruned.txt"
 """File with which a search asks a job to end its training, because other trials have lower validation losses."""
 _COMMAND = "multirun.yaml"
 """File that Hydra leaves in the folder of a sweep."""
+_MODEL = "checkpoints/model.ckpt"
 
 
 _NUMBER, _TEXT = (int, float), (str, type(None))
@@ -78,6 +81,31 @@ def find_job_folders(folder: Path) -> list[Path]:
         if is_job or (path != folder and _COMMAND in files):
             below.clear()
     return sorted(job_folders, key=natural_order_key)
+
+
+def find_members(members: str | Sequence[str]) -> list[str | Path]:
+    """Return the run folders, checkpoint files or MLflow run ids of the members.
+
+    If `members` is a folder, the members are the runs directly in it that contain a trained model, sorted by name. If
+    the folder contains no such run, the members are the jobs with a trained model at any depth.
+
+    Raises:
+        ConfigError: There are fewer than two members.
+    """
+    if not isinstance(members, str):
+        listed: list[str | Path] = list(members)
+    else:
+        folder = Path(members).expanduser()
+        require_enclosed(folder, ConfigError)
+        runs = sorted((path.parent.parent for path in folder.glob(f"*/{_MODEL}")), key=natural_order_key)
+        listed = [*(runs or (job for job in find_job_folders(folder) if (job / _MODEL).is_file()))]
+    if len(listed) < 2:
+        raise ConfigError(
+            f"mode.members = {members!r} names {len(listed)} trained model{'' if len(listed) == 1 else 's'}, but at "
+            "least two are required. Give the folder of a sweep (outputs/sweeps/<time>), or a list of run folders, "
+            "checkpoint files or MLflow run ids."
+        )
+    return listed
 
 
 def write_value(folder: Path, value: float) -> None:

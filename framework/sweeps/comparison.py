@@ -4,9 +4,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from framework.configuration.modes import MODES
+from framework.configuration.paths import flatten
 from framework.configuration.settings import store_experiment
+from framework.errors import UserError
 from framework.reports.table import markdown, results_table, write_csv
-from framework.runs.job import find_job_folders, read_record
+from framework.runs.job import find_job_folders, find_members, read_record
 from framework.runs.resuming import stored_config
 from framework.storage.progress import output
 from framework.sweeps.results import Comparison, compare, comparison_figure, job_results
@@ -28,12 +31,37 @@ def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
         return None
     # not None if a sweep is repeated in this folder; the earlier sweep may have been killed
     earlier = read_run_info(folder)
-    tracker = _parent(folder, config, earlier, store_experiment(config))
+    tracker = _parent(folder, config, earlier, experiment_of(config))
     tracker.open()
     tracker.set_tags({"mode": "sweep", "folder": str(folder), DESCRIPTION: f"A sweep in `{folder}`."})
     run_id = tracker.run_id
     tracker.leave_open()
     return run_id
+
+
+def experiment_of(config: Mapping[str, Any]) -> str:
+    """Return the experiment of a sweep's jobs in the tracking store; it may depend on the stored model that they use.
+
+    Args:
+        config: Composed config of the first job.
+    """
+    mode = config.get("mode") or {}
+    name = str(mode.get("name"))
+    if not (name in MODES and MODES[name].stored):
+        return store_experiment(config)
+    try:
+        members = mode.get("members")
+        model = find_members(members)[0] if isinstance(members, str | list) else config.get("checkpoint")
+        if model is None:
+            return store_experiment(config)
+        from framework.configuration.loading import read_stored  # imports torch, which few sweeps need here
+
+        stored = flatten(config.get("stored") or {})
+        description, _ = read_stored(model, uri=store_of(config), paths=stored)
+    except UserError:  # the jobs report the error
+        return store_experiment(config)
+    experiment = config.get("experiment_name") or description.settings.get("experiment_name")
+    return store_experiment({**config, "experiment_name": experiment}, description.config["data"]["name"])
 
 
 def summarise(folder: Path, overrides: Sequence[Sequence[str]], config: Mapping[str, Any]) -> None:
