@@ -1,11 +1,18 @@
 """Tests of mode=predict with other data settings than in the run, which change the reading or are refused."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+from framework.data import Data
+from framework.datasets.fields import Fields
+from framework.runs.session import _count_equal_samples
 from tests.conftest import Framework
 
 QUIET = ("logger=none", "threads=1")
@@ -58,6 +65,25 @@ def images(folder: Path) -> tuple[list[str], Path, dict[str, str | None]]:
             "data.image_size=32": "reads inputs of shape",
         },
     )
+
+
+@pytest.mark.parametrize(
+    ("differs", "expected"), [(-1, 1024), (9, None), (99, None), (900, None), (1050, 1024)]
+)
+def test_a_setting_that_changes_any_compared_sample_has_an_effect(differs: int, expected: int | None) -> None:
+    def reading(changed: int) -> Callable[[Sequence[Path]], Fields]:
+        """Return a function that reads ten samples from each file; the number `changed` is read as -2."""
+
+        def read(files: Sequence[Path]) -> Fields:
+            numbers = torch.tensor([10 * int(file.name) + row for file in files for row in range(10)])
+            return Fields(input=torch.where(numbers == changed, -2, numbers))
+
+        return read
+
+    files = [Path(str(number)) for number in range(200)]
+    stored = cast(Data, SimpleNamespace(read=reading(-1)))
+    assert _count_equal_samples(stored, reading(differs), files) == expected
+    assert _count_equal_samples(stored, reading(differs), files[:5]) == (None if differs == 9 else 50)
 
 
 @pytest.mark.parametrize(

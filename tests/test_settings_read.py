@@ -7,14 +7,16 @@ from dataclasses import replace
 from importlib import import_module
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import pytorch_lightning as pl
+import torch
 import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from torch.distributions import Categorical, Distribution, Gumbel, Independent
 
 from framework.configuration import composition
 from framework.configuration.config import Config
@@ -37,6 +39,9 @@ from framework.configuration.settings import (
     TrainerSettings,
 )
 from framework.errors import ConfigError
+from framework.runs.session import Session, note_idle_samples
+from framework.storage.progress import output
+from framework.target import Target
 from framework.training.schedules import Plateau, make_schedule
 
 GROUPED = {"optimizer": OptimizerSettings, "logger": LoggerSettings, "trainer": TrainerSettings}
@@ -240,3 +245,34 @@ def test_what_another_setting_leaves_without_effect_is_said(override: str, value
         "mode": {"name": "test"},
     }
     assert not list(idle_sentences(used, [override]))
+
+
+class Fixed(torch.nn.Module):
+    """Predictor that returns the same density for every input."""
+
+    def __init__(self, density: Distribution) -> None:
+        super().__init__()
+        self.density = density
+
+    def forward(self, inputs: torch.Tensor) -> Distribution:
+        return self.density
+
+
+@pytest.mark.parametrize(
+    ("density", "idle"),
+    [
+        (Categorical(logits=torch.zeros(6, 3)), True),
+        (Independent(Gumbel(torch.zeros(6, 2), torch.ones(6, 2)), 1), False),
+    ],
+)
+def test_samples_that_a_closed_form_does_not_need_are_noted(
+    density: Distribution, idle: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for overrides in (["samples=50"], ["seed=1"]):
+        config = Config(Settings(), Path(), overrides)
+        predictor, cpu = cast(Any, Fixed(density)), torch.device("cpu")
+        target = Target("class", ("a", "b", "c"))
+        session = Session(config, {}, "", target, cast(Any, None), predictor, cpu, output())
+        note_idle_samples(session, {"input": torch.zeros(6, 1)})
+        noted = "note: samples=50 has no effect: the point predictions" in capsys.readouterr().out
+        assert noted == (idle and overrides == ["samples=50"])

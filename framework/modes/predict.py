@@ -4,7 +4,8 @@ Predicted images, and maps if the data set draws them, are written as files besi
 """
 
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from framework.configuration.config import Config, Options
 from framework.configuration.settings import Settings
-from framework.data import Data, Mapped
+from framework.data import Batch, Data, Mapped
 from framework.distributions.intervals import DRAWS
 from framework.distributions.noise import Draw
 from framework.distributions.protocol import value_set
@@ -28,7 +29,7 @@ from framework.evaluation.splits import BLOCK, predict
 from framework.model import Predictor
 from framework.prediction import Prediction, table_columns
 from framework.runs.run import open_run
-from framework.runs.session import for_trained
+from framework.runs.session import for_trained, note_idle_samples
 from framework.runs.user_files import UNREADABLE, list_files, print_left_out, select_files
 from framework.storage.names import spell_name
 from framework.target import Target
@@ -68,7 +69,14 @@ def run(config: Config) -> None:
             )
         images = run.folder / "images"
         table, mapped = predictions(
-            session.predictor, session.data, session.target, files, session.settings, images, options.interval
+            session.predictor,
+            session.data,
+            session.target,
+            files,
+            session.settings,
+            images,
+            options.interval,
+            partial(note_idle_samples, session),
         )
         path = run.folder / "predictions.csv"
         with path.open("w", newline="", encoding="utf-8") as stream:
@@ -99,6 +107,7 @@ def predictions(
     settings: Settings,
     images: Path,
     mass: float | None = None,
+    examine: Callable[[Batch], None] = lambda batch: None,
 ) -> tuple[dict[str, list[str]], list[tuple[Tensor, Tensor]]]:
     """Return the columns of the CSV table by name, and the tensors from which the data set draws maps.
 
@@ -107,7 +116,8 @@ def predictions(
     intervals are estimated from random values. If the data set draws maps of `files`, the tensors are, for each
     batch, the point predictions and the standard deviations, each (batch, number); otherwise there are none.
 
-    Predicted images are written to the folder `images`, and the row contains the name of the image file.
+    Predicted images are written to the folder `images`, and the row contains the name of the image file. `examine` is
+    called with the first batch.
     """
     dataset = data.read(files) if files else data.splits().test
     loader = Batches(data, batch_size=BLOCK, workers=settings.workers, seed=settings.seed).of(dataset)
@@ -115,6 +125,8 @@ def predictions(
     cells: dict[str, list[str]] = {}
     mapped: list[tuple[Tensor, Tensor]] = []
     for number, batch in enumerate(track_batches(loader, "predicting")):
+        if number == 0:
+            examine(batch)
         prediction = predict(predictor, batch, settings.samples, Draw(settings.seed, number))
         prediction = prediction.in_frame(data.frame(batch))
         columns: dict[str, Sequence[Any] | Tensor] = {}

@@ -19,7 +19,7 @@ from framework.reports.report import save_picture
 from framework.reports.table import Better, machine, results_table, write_csv
 from framework.runs.job import refuse_idle
 from framework.runs.run import Run, open_run
-from framework.runs.session import Session, for_trained
+from framework.runs.session import Session, for_trained, note_idle_samples
 
 ERROR, AXIS = "error_nats", "error of the mean log-likelihood (nats, RMS)"
 """Key of the error that is measured by default for a knob of a density head, and label of its axis."""
@@ -57,9 +57,11 @@ def _measure(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
     compared = len(measured) < len(better)
     _refuse_unmeasured(run.config, bool(measured), compared)
     predictor.to(session.device)
+    batches = _first_samples(session, options.limit)
+    note_idle_samples(session, batches[0])
     curve = tradeoff(
         predictor,
-        _first_samples(session, options.limit),
+        batches,
         metrics if measured else (),
         knob=knob,
         values=options.values or owner.knobs[knob],

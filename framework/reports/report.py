@@ -15,7 +15,7 @@ from framework.metric import HasFigure
 from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, machine, results_table
 from framework.runs.provenance import package_versions
 from framework.runs.run import Run
-from framework.runs.session import Session
+from framework.runs.session import Session, note_idle_samples
 from framework.storage.files import write_whole
 from framework.training.batches import track_batches
 
@@ -46,6 +46,7 @@ def report_test(run: Run, session: Session) -> None:
         else track_batches(blocks.of(outliers.splits().test), "testing on outliers"),
     )
     batch = next(iter(session.batches().test_dataloader()))
+    note_idle_samples(session, batch)
     run_cost = cost(session.predictor, batch, samples=settings.samples, device=session.device)
     columns = {key: heading for metric in metrics for key, heading in metric.columns.items()}
     better: Better = {**{key: way for metric in metrics for key, way in metric.better.items()}, **COST_BETTER}

@@ -48,8 +48,9 @@ from framework.configuration.settings import Settings, device_of
 from framework.data import Batch, Data, Mapped
 from framework.datasets.fields import fetch
 from framework.density_head import Fitted
-from framework.distributions.noise import seed_step
-from framework.errors import CheckpointError, ConfigError, UserError
+from framework.distributions.noise import Draw, seed_step
+from framework.distributions.protocol import median
+from framework.errors import CheckpointError, ConfigError, UserError, shorten
 from framework.evaluation.splits import BLOCK, numbers, on_device, require_unique_name
 from framework.model import Predictor, fitted_models, learns
 from framework.objective import Objective
@@ -71,6 +72,8 @@ if TYPE_CHECKING:  # a metric imports torchmetrics, which predictions do not nee
 
 FEW = 8
 """Number of validation samples with which uncertainty wrappers are tried before training; some need more than one."""
+MOST_COMPARED = 1024
+"""Largest number of the user's samples that are read twice to find out whether a setting of the data has an effect."""
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # constants of malloc.h
 
 
@@ -509,8 +512,8 @@ def _read_files(
 
     Raises:
         CheckpointError: The first sample has another shape than the inputs of the model.
-        ConfigError: The choice of the data set has no effect: the model's own data set reads the first files as the
-            same samples.
+        ConfigError: The choice of the data set has no effect: the model's own data set reads the same samples. If more
+            than `MOST_COMPARED` samples would have to be compared, a note is printed instead.
     """
     samples = read(files)
     first_shape, model_shape = tuple(fetch(samples, range(1))["input"].shape[1:]), description.input_shape
@@ -526,30 +529,59 @@ def _read_files(
         skips = any(
             "unreadable=" in item for item in config.overrides
         )  # the mode reads this key, not the data set
-        first_files = list(files[:FEW])
-        if not skips and _same_samples(_read_as_trained(description, first_files), read(first_files)):
+        count = None if skips else _count_idle_samples(description, read, files)
+        if count == len(samples):  # type: ignore[arg-type]
             refuse_idle(
                 config.folder,
                 idle_sentence(override, f"the model reads {files[0]} in the same way without it"),
             )
+        elif count is not None:
+            note = f"note: {shorten(override)} changes nothing in the first {count} of {len(samples)} samples"  # type: ignore[arg-type]
+            output().print(note, soft_wrap=True, highlight=False, markup=False)
     return samples
 
 
-def _read_as_trained(description: Description, files: Sequence[Path]) -> Dataset[Batch] | None:
-    """Return the samples of files as the model's own data set reads them, or None if it cannot read them."""
+def _count_idle_samples(
+    description: Description, read_chosen: Callable[[Sequence[Path]], Dataset[Batch]], files: Sequence[Path]
+) -> int | None:
+    """Return the number of the first samples that the data set of the model reads in the same way, None if one differs.
+
+    The arguments are those of `_read_files`; `_count_equal_samples` limits the number.
+    """
     stored = read(Path(description.path))["framework"]["config"]["data"]
     try:
         config, _ = remove_paths({"data": stored}, {})
-        return reader(replace(description, config={**description.config, **config}, dropped={})).read(files)
+        data = reader(replace(description, config={**description.config, **config}, dropped={}))
+        return _count_equal_samples(data, read_chosen, files)
     except UserError:  # for example, the data set needs a path that only the command gives
         return None
 
 
-def _same_samples(stored_samples: Dataset[Batch] | None, samples: Dataset[Batch]) -> bool:
-    if stored_samples is None or len(stored_samples) != len(samples):  # type: ignore[arg-type]
-        return False
-    first, second = (fetch(dataset, range(min(BLOCK, len(dataset)))) for dataset in (stored_samples, samples))  # type: ignore[arg-type]
-    return first.keys() == second.keys() and all(torch.equal(first[key], second[key]) for key in first)
+def _count_equal_samples(
+    stored: Data, read_chosen: Callable[[Sequence[Path]], Dataset[Batch]], files: Sequence[Path]
+) -> int | None:
+    """Return the number of samples that two data sets read alike from the first files, or None if any sample differs.
+
+    Args:
+        stored: Data set that the model was trained on.
+        read_chosen: Method `read` of the data set that the command chooses.
+        files: Files of the user, which are compared in order until `MOST_COMPARED` samples have been read.
+    """
+    count = 0
+    for first in range(0, len(files), FEW):
+        pair = [read_files(files[first : first + FEW]) for read_files in (stored.read, read_chosen)]
+        sizes = [len(samples) for samples in pair]  # type: ignore[arg-type]
+        if sizes[0] != sizes[1]:
+            return None
+        for start in range(0, sizes[0], BLOCK):
+            if count >= MOST_COMPARED:
+                return count
+            rows = range(start, min(start + BLOCK, sizes[0]))
+            one, other = (fetch(samples, rows) for samples in pair)
+            if one.keys() != other.keys() or not all(torch.equal(one[key], other[key]) for key in one):
+                return None
+            count += len(rows)
+    return count
 
 
 def inherit_settings(config: Config, description: Description) -> Config:
@@ -630,6 +662,28 @@ def trained_batches(batches: Batches) -> Iterator[Batch]:
             count = len(batch["input"])
             yield {**require_targets(batch, batches.data.target), "row": torch.arange(first, first + count)}
             first += count
+
+
+@torch.no_grad()
+def note_idle_samples(session: Session, batch: Batch) -> None:
+    """Print a note if the command sets `samples`, but the point predictions of the model need no samples.
+
+    Args:
+        session: Session with a trained predictor on the session's device.
+        batch: Inputs for which the model predicts.
+    """
+    override = session.config.first_override("samples")
+    if override is None:
+        return
+    with Draw(0, 0)("density"):
+        density = session.predictor(batch["input"].to(session.device))
+    points = []
+    for seed, samples in ((0, 1), (1, 3)):
+        with Draw(seed, 0)("point"):
+            points.append(median(density, samples))
+    if torch.equal(*points):
+        why = "the point predictions of this model have a closed form, which needs no samples"
+        session.console.print(f"note: {idle_sentence(override, why)}", soft_wrap=True, markup=False)
 
 
 def keep_memory() -> None:
