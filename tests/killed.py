@@ -36,7 +36,8 @@ def end(how: str) -> None:
 def plant() -> None:
     """Let this process end at the moment that KILL names, if this process is that rank."""
     rank, moment, how = os.environ["KILL"].split("|")
-    if os.environ.get("LOCAL_RANK", "0") != rank:
+    own = [os.environ[name] for name in ("RANK", "SLURM_PROCID", "LOCAL_RANK") if name in os.environ]
+    if (own or ["0"])[0] != rank:
         return
     place = PLACES[moment]
     if place is None:

@@ -204,7 +204,7 @@ def test_what_a_resumed_run_computes_is_not_changed(
     done = framework(f"resume={tmp_path / 'copy'}", "threads=1", "batch_size=4")
     assert done.code == 2
     assert "batch_size=4 would change" in done.out
-    assert "threads, workers, logger.uri may be overridden" in done.out
+    assert "Only threads, workers, logger.uri, trainer.devices," in done.out
 
 
 @pytest.mark.parametrize(

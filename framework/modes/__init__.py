@@ -18,6 +18,7 @@ from framework.storage.enclosed import require_enclosed
 from framework.storage.first_rank import first_rank
 from framework.storage.imports import without_collection
 from framework.tracking.store_process import started_early
+from framework.training.process_count import require_processes
 
 
 def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float | None:
@@ -49,6 +50,7 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
         with without_collection():
             if name == "train":  # find mistakes before the slow import of Lightning
                 require_device(config.settings.trainer.get("accelerator"))
+                require_processes(config.settings.trainer)
                 _ = config.assembly
             mode = import_module(f"framework.modes.{name}")
         return mode.run(config)

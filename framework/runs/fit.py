@@ -161,7 +161,7 @@ def _fit_by_gradient(session: Session, run: Run) -> Fitted:
     several = outermost(session.predictor)
     batches.orders = several.model_count if several else 1
     loaded = LoadedBatches(batches, trainer)
-    resume = begin_again(run, session.console)
+    resume = begin_again(run, session.console, trainer.world_size, batches.orders)
     with end_together(trainer, run.stopper, partial(_give_up, run)):
         trainer.fit(training, datamodule=loaded, ckpt_path=resume, weights_only=True)
         _leave_process_group()

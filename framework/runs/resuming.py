@@ -37,6 +37,10 @@ if TYPE_CHECKING:
 
 HOW = ("threads", "workers", "logger.uri")
 """Keys that do not affect the result of a run, so that a resumed run may have other values of them."""
+PROCESSES = ("trainer.devices", "trainer.num_nodes", "trainer.strategy")
+"""Keys that say how many processes train; a resumed run may have other values, which change its results by rounding."""
+CHANGEABLE = (*HOW, *PROCESSES)
+"""Keys of which a resumed run may have other values."""
 TRAINED = ("last.ckpt", "previous.ckpt")
 """Names of checkpoints from which training can resume; all others hold weights only."""
 BEST = "best.ckpt"
@@ -61,20 +65,20 @@ def read_command(
 ) -> tuple[dict[str, Any], list[str]]:
     """Return the config and overrides with which the run in `folder` was started.
 
-    Values of keys that do not affect the results (`HOW`) are taken from `command_values`, the config of the present
-    command, if the command sets them.
+    Values of the keys in `CHANGEABLE` are taken from `command_values`, the config of the present command, if the
+    command sets them.
 
     Raises:
         ConfigError: The run has finished, its files are damaged, or the command changes the run's config or does not
             repeat its paths.
     """
     keys = {item: item.lstrip("+~").partition("=")[0] for item in overrides}
-    allowed = ("resume", "checkpoint", *HOW)  # and keys `stored.…`, which repeat stored paths
+    allowed = ("resume", "checkpoint", *CHANGEABLE)  # and keys `stored.…`, which repeat stored paths
     changing = [item for item, key in keys.items() if key not in allowed and not key.startswith("stored.")]
     if changing:
         raise ConfigError(
             f"resume={folder} continues with the config of that run, which {' '.join(changing)} would change. "
-            f"Leave these overrides out, or start a new run. Only {', '.join(HOW)} may be overridden."
+            f"Leave these overrides out, or start a new run. Only {', '.join(CHANGEABLE)} may be overridden."
         )
     earlier = read_run_info(folder)
     if earlier is not None and earlier.status == "FINISHED":
@@ -98,7 +102,7 @@ def read_command(
     repeated |= {"checkpoint": command_values["checkpoint"]} if "checkpoint" in keys.values() else {}
     require_repeated(paths_of(values), repeated, folder)
     values["resume"] = "auto"  # also if the run was started with resume=never
-    for key in HOW:
+    for key in CHANGEABLE:
         if key in keys.values():
             group, _, name = key.rpartition(".")
             target, source = (values[group], command_values[group]) if group else (values, command_values)
@@ -137,7 +141,7 @@ def _same_settings(stored: Mapping[str, Any] | None, settings: Settings) -> bool
         {
             key: value
             for key, value in provenance.flatten(each.model_dump()).items()
-            if key not in ("resume", *HOW)
+            if key not in ("resume", *CHANGEABLE)
         }
         for each in (earlier, settings)
     )
@@ -155,22 +159,46 @@ def find_resumable(folder: Path) -> Path | None:
     return best if best is not None and can_resume_from_best(checkpoints.read(best)) else None
 
 
-def begin_again(run: "Run", console: "Console") -> Path | None:
+def begin_again(run: "Run", console: "Console", processes: int, models: int) -> Path | None:
     """Return the checkpoint from which the training of `run` continues, or None if it begins anew.
 
     The metrics of steps after the checkpoint are removed from the journal of a resumed run, because the run repeats
     these steps. All ranks must call this function before rank 0 writes a checkpoint, so that all find the same one.
+
+    Args:
+        run: Run in progress.
+        console: Console on which to say from where the run continues.
+        processes: Number of processes that train now.
+        models: Number of models that train together.
+
+    Raises:
+        ConfigError: Several models train together, and either one process trained before and several train now, or the
+            other way round. The models have batches of their own only if one process trains.
     """
     from framework.storage import checkpoints
 
     checkpoint = find_resumable(run.checkpoints) if run.resumed else None
-    if run.resumed and first_rank():
-        step = 0 if checkpoint is None else int(checkpoints.read(checkpoint)["global_step"])
-        run.tracker.drop_after(step)
+    if not run.resumed or not first_rank():
+        return checkpoint
+    if checkpoint is None:
+        run.tracker.drop_after(0)
+        console.print("nothing to resume from yet: starting from the beginning.")
+        return None
+    stored = checkpoints.read(checkpoint)
+    step, before = int(stored["global_step"]), stored.get("processes")
+    before = before if isinstance(before, int) else processes  # an earlier version did not store the number
+    if models > 1 and (before == 1) != (processes == 1):
+        raise ConfigError(
+            f"{checkpoint} was written by {before} processes, and {processes} train now. The {models} models of this "
+            "run have batches of their own if one process trains, and share their batches if several do. Resume the "
+            "run on as many processes as before."
+        )
+    run.tracker.drop_after(step)
+    console.print(f"resuming from {checkpoint} (step {step}).")
+    if before != processes:
         console.print(
-            "nothing to resume from yet: starting from the beginning."
-            if checkpoint is None
-            else f"resuming from {checkpoint} (step {step})."
+            f"{before} processes trained before, and {processes} train from here on: the results are those of one run "
+            "on the same processes to rounding, not to the last bit."
         )
     return checkpoint
 
@@ -179,8 +207,18 @@ def resume_arguments(run: "Run") -> str:
     """Return the arguments of the command that continues a run, quoted for a shell."""
     # the address of a store and paths are included, because stored ones are used only if the user repeats them
     store = run.settings.logger.uri
-    own = [f"resume={run.folder}", *([f"logger.uri={store}"] if store else [])]
-    return " ".join([*map(shlex.quote, own), *shell_arguments(paths_of(run.settings.plain()))])
+    own = [
+        shlex.quote(item) for item in (f"resume={run.folder}", *([f"logger.uri={store}"] if store else []))
+    ]
+    chosen = run.settings.trainer
+    trainer = (stored_config(run.folder) or {"trainer": chosen}).get("trainer") or {}
+    changed = {key: chosen.get(key.partition(".")[2]) for key in PROCESSES}
+    own += [
+        shlex.quote(f"{key}={'null' if value is None else value}")
+        for key, value in changed.items()
+        if trainer.get(key.partition(".")[2]) != value
+    ]
+    return " ".join([*own, *shell_arguments(paths_of(run.settings.plain()))])
 
 
 def remove_resume_files(run: "Run") -> None:

@@ -88,8 +88,13 @@ def open_run(config: Config) -> Iterator[Run]:
     stopper = Stopper()
     earlier, resumed = read_run_info(config.folder), may_resume(config)
     if not first_rank():
-        with stopper.installed():
-            yield Run(config, SilentTracker(config.folder), stopper, resumed)
+        try:
+            with stopper.installed():
+                yield Run(config, SilentTracker(config.folder), stopper, resumed)
+        finally:
+            # Hydra has made a folder for each process, unless the command names one
+            with suppress(OSError):
+                config.folder.rmdir()
         return
     config.folder.mkdir(parents=True, exist_ok=True)
     tracker = _tracker(config, earlier.run_id if resumed and earlier else None, resumed)

@@ -293,8 +293,9 @@ class Training(pl.LightningModule):
         return max(1, min(steps, trainer.max_steps) if trainer.max_steps >= 0 else steps), epoch
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the description of the model (`configuration.description`) to the checkpoint."""
+        """Add the description of the model (`configuration.description`) and the number of processes."""
         checkpoint["framework"] = self.description
+        checkpoint["processes"] = self.trainer.world_size
 
     def _non_finite_message(self, losses: Tensor, batch: Batch, value: float) -> str:
         """Return the error message for a loss that is not finite; it names the samples that caused it."""

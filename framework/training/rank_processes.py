@@ -138,6 +138,15 @@ def end_together(
         yield
     except RuntimeError as error:
         cause = guard.cause(_MOMENT) if _is_collective_error(error) else None
+        if (
+            cause is None
+            and ours.cluster_environment.creates_processes_externally
+            and _is_collective_error(error)
+        ):
+            cause = RankFailed(
+                f"The connection to another process of the training was lost ({_first_line(error)}), because that "
+                "process has ended or its node cannot be reached. Look at the output of the other processes."
+            )
         guard.leave(cause)
         if cause is None:
             raise
@@ -146,6 +155,10 @@ def end_together(
         guard.leave(None)
         raise
     guard.end()
+
+
+def _first_line(error: BaseException) -> str:
+    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
 
 
 def _is_collective_error(error: BaseException) -> bool:
