@@ -99,3 +99,13 @@ def test_runs_sweeps_and_sync_keep_the_store_in_their_folder(
     synced = framework("mode=sync", f"mode.run={in_quotes(str(job))}", folder=None)
     assert synced.code == 0, synced.out
     assert list((tmp_path / "home").iterdir()) == [base], "nothing lies elsewhere"
+
+
+def test_a_database_without_its_package_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("framework.tracking.stores.find_spec", lambda name: None)
+    with pytest.raises(
+        ConfigError, match=r"needs the package psycopg2, which is not installed\. Use postgresql\+psy"
+    ):
+        address("postgresql+psycopg2://db/x", tmp_path)
+    with pytest.raises(ConfigError, match="needs the package psycopg,"):
+        address("postgresql://me:secret@db/x", tmp_path)

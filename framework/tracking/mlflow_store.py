@@ -26,6 +26,8 @@ from framework.tracking.stores import address, require_own_files, sqlite_path, s
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
 # One retry instead of minutes of retries: the caller tries again, and must notice in between that it has to end.
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
+# The framework prints the address of the run itself, without a password.
+os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # MLflow warns about its own dependencies
     from mlflow import MlflowClient, artifacts

@@ -9,6 +9,7 @@ addresses, and the program contacts the address that the user gave.
 import os
 import re
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from urllib.parse import quote, unquote, urlsplit
 
@@ -49,10 +50,12 @@ def address(named: str | None, folder: Path) -> Address:
         folder: Folder of the run.
 
     Raises:
-        ConfigError: MLflow cannot keep runs at the address, or the address contains a folder whose name is not UTF-8.
+        ConfigError: MLflow cannot keep runs at the address, the address contains a folder whose name is not UTF-8, or
+            the package that connects to the database is missing.
     """
     user_uri = named or os.environ.get(SETTING)
     uri = store_uri(user_uri) if user_uri else default_uri(folder)
+    _require_driver(uri)
     path = sqlite_path(uri)
     if path is not None and re.search(r"[\ud800-\udfff]", str(path)):
         raise ConfigError(
@@ -111,6 +114,19 @@ def store_uri(uri: str) -> str:
             "server, or a postgresql, mysql or mssql address. MLflow no longer keeps runs in plain folders."
         )
     return uri
+
+
+def _require_driver(uri: str) -> None:
+    """Refuse an address of a PostgreSQL database whose Python package is not installed."""
+    scheme = uri.partition(":")[0]
+    if scheme.partition("+")[0] != "postgresql":
+        return
+    driver = scheme.partition("+")[2] or "psycopg"  # SQLAlchemy's default
+    if find_spec(driver) is None:
+        raise ConfigError(
+            f"logger.uri={shorten(without_password(uri))} needs the package {driver}, which is not installed. Use "
+            "postgresql+psycopg2://… and install psycopg2: pip install '.[postgres]'"
+        )
 
 
 def sqlite_uri(path: Path) -> str:
