@@ -187,7 +187,7 @@ def test_samples_that_are_nearly_impossible_are_reported():
 
 
 def test_wrong_settings_are_refused():
-    with pytest.raises(ConfigError, match="have one for each group"):
+    with pytest.raises(ConfigError, match="each needs one number for each group"):
         folds(dropout=[0.1])
     with pytest.raises(ConfigError, match="needs at least 6 samples"):
         folds().train_models(*table(5), seed=0, batch_size=16)
