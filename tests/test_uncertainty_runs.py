@@ -89,6 +89,11 @@ def test_a_sweep_becomes_an_ensemble_and_its_first_member_is_trained_alike_in_on
     )
     assert results(scaled)["method"] == "vanilla_128 + ensemble + temperature"
 
+    # a combined model may be a member again
+    twice = f"mode.members=[{scaled.folder},{scaled.folder}]"
+    nested = framework("mode=combine", twice, "logger=none", "threads=1", folder="nested")
+    assert results(nested)["nll"] == pytest.approx(results(scaled)["nll"], rel=1e-6)
+
     # trained in one pass, with the seed of the first: its first member saw the same batches from the same start
     once = framework(*SMALL, "uncertainty=[ensemble]", "uncertainty.ensemble.members=3", folder="once")
     results(once)
