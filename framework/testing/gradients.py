@@ -24,7 +24,8 @@ def gradient(subject: HeadSubject, worst: Worst) -> None:
     The derivatives are compared with central differences for each item of the batch, at random targets and at draws. Of
     three step lengths, the one with the smallest error counts, since a small step suffers from rounding and a large one
     may cross a kink. If all three disagree, three smaller steps follow, which resolve a narrow density. Then the
-    difference that is closest to the difference with the previous step counts, whatever its error is.
+    difference that is closest to the difference with the previous step counts, whatever its error is. A derivative that
+    agrees with the difference on one side is right too, since the loss may have a kink at the target.
     """
     head = subject.make().double().train()
     for size in (0.1, 1.0, 3.0, 30.0, 1e3):
@@ -60,6 +61,8 @@ def gradient(subject: HeadSubject, worst: Worst) -> None:
                     # The density is narrower than the steps, or a kink lies within them, so smaller steps are tried.
                     differences += [difference_at(step) for step in steps[3:]]
                     error = torch.minimum(error, most_certain(differences).error(analytic, least))
+                    for candidate in differences[:3]:  # smaller steps have too much rounding to show a kink
+                        error = torch.minimum(error, candidate.error_at_kink(analytic, least))
                 numeric = most_certain(differences).slope
                 # differences of large losses have fewer correct digits
                 worst.record(
@@ -77,10 +80,12 @@ class Difference(NamedTuple):
     Attributes:
         slope: Estimate of the derivative.
         noise: Bound on the error of `slope` from rounding.
+        sides: Differences to the left and to the right, (2, ...).
     """
 
     slope: Tensor
     noise: Tensor
+    sides: Tensor
 
     def error(self, analytic: Tensor, least: Tensor | float) -> Tensor:
         """Return the part of |analytic - slope| that exceeds the noise, relative to the slope.
@@ -91,6 +96,14 @@ class Difference(NamedTuple):
         """
         scale = self.slope.abs().clamp(min=1e-3).maximum(torch.as_tensor(least))
         return ((analytic - self.slope).abs() - self.noise).clamp(min=0) / scale
+
+    def error_at_kink(self, analytic: Tensor, least: Tensor | float) -> Tensor:
+        """Return the error as `error` does, relative to the difference on the side that is nearer to the derivative.
+
+        For a loss without a kink, both differences are close to the slope.
+        """
+        scale = self.sides.abs().clamp(min=1e-3).maximum(torch.as_tensor(least))
+        return (((analytic - self.sides).abs() - 2 * self.noise).clamp(min=0) / scale).amin(0)
 
 
 @torch.no_grad()
@@ -107,15 +120,16 @@ def difference(
         whole: If true, return the difference of the sum of all losses, otherwise of each loss.
     """
     ends = []
-    for sign in (1, -1):
+    for sign in (1, -1, 0):
         argument += sign * step * direction
         ends.append(loss())
         argument -= sign * step * direction
     if whole:
         ends = [end.sum() for end in ends]
+    sides = torch.stack([ends[2] - ends[1], ends[0] - ends[2]]) / step
     # bound on the effect of rounding in the two losses and in the quantities from which they are computed
     noise = 16 * torch.finfo(torch.float64).eps * ends[0].abs() / step
-    return Difference((ends[0] - ends[1]) / (2 * step), noise)
+    return Difference((ends[0] - ends[1]) / (2 * step), noise, sides)
 
 
 def most_certain(differences: Sequence[Difference]) -> Difference:
@@ -123,10 +137,15 @@ def most_certain(differences: Sequence[Difference]) -> Difference:
 
     The uncertainty of a difference is its distance from the difference with the previous step, plus its noise.
     """
-    slope, noise = (torch.stack(parts) for parts in zip(*differences, strict=True))
+    slope = torch.stack([candidate.slope for candidate in differences])
+    noise = torch.stack([candidate.noise for candidate in differences])
+    sides = torch.stack([candidate.sides for candidate in differences])
     doubt = (slope[1:] - slope[:-1]).abs() + noise[1:]
     best = doubt.nan_to_num(nan=math.inf).argmin(0, keepdim=True)
-    return Difference(slope[1:].gather(0, best)[0], noise[1:].gather(0, best)[0])
+    both = best.unsqueeze(1).expand(1, *sides.shape[1:])
+    return Difference(
+        slope[1:].gather(0, best)[0], noise[1:].gather(0, best)[0], sides[1:].gather(0, both)[0]
+    )
 
 
 def _directions(argument: Tensor, raw: bool, size: float, number: int) -> Iterator[tuple[str, Tensor]]:
