@@ -32,6 +32,7 @@ CHAINS = {
     "mc_dropout": "[mc_dropout,conformal]",
     "ensemble": "[ensemble,conformal]",
     "platt": "[platt,conformal]",
+    "folds": "[folds,conformal]",
 }
 """Wrappers, each inside the wrapper for conformal prediction sets."""
 ELSEWHERE = {"refined"}
@@ -43,6 +44,7 @@ OFTEN = {
     "mc_dropout": ("degrees",),
     "ensemble": ("class",),
     "platt": ("class",),
+    "folds": ("real",),
 }
 """Kinds of targets that are always tested for each wrapper; the other kinds are slow tests."""
 PROMISED = 0.8
@@ -73,10 +75,15 @@ def trained(framework: Framework, table: Path, kind: str, chain: str) -> Done:
         *("data=tabular", f"data.path={table}", f"data.target={target}", "data.columns=[a,b]"),
         *(f"data.kind={kind.removeprefix('several ').removesuffix('s') if 'real' in kind else kind}",),
         *(f"density_head={head}", "encoder=[mlp]", "encoder.mlp.widths=[16]", "encoder.mlp.dropout=0.1"),
-        *("metric=[log_likelihood,prediction_set]", f"uncertainty={chain}", "trainer.max_epochs=2"),
+        *("metric=[log_likelihood,prediction_set]", f"uncertainty={chain}"),
         *(f"uncertainty.conformal.miscoverage={1 - PROMISED:g}", "samples=200", "logger=none"),
         *("pictures=false", "threads=1"),
         *(("uncertainty.ensemble.members=2",) if "ensemble" in chain else ()),
+        *(
+            ("uncertainty.folds.steps=60", "uncertainty.folds.epochs=2")
+            if "folds" in chain
+            else ("trainer.max_epochs=2",)
+        ),
     )
     assert done.code == 0, done.out
     return done
@@ -84,7 +91,7 @@ def trained(framework: Framework, table: Path, kind: str, chain: str) -> Done:
 
 def drawn(kind: str, wrapper: str) -> bool:
     """Return whether sizes are volumes that are estimated from draws: those of mixtures of several numbers."""
-    return kind == "several reals" and wrapper in ("mc_dropout", "ensemble")
+    return kind == "several reals" and wrapper in ("mc_dropout", "ensemble", "folds")
 
 
 def test_every_wrapper_is_asked() -> None:

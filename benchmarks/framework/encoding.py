@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.commands import carry_out
 from benchmarks.pages import machine, write_page
 from benchmarks.timing import ROUNDS, median_and_range
 
@@ -98,7 +99,7 @@ def command(folder: Path, into: Path, *words: str, several: bool = True) -> list
 def run(words: Sequence[str]) -> tuple[float, float]:
     """Run a command; return its wall time and its processor time with all its processes, seconds."""
     before, start = _processor_seconds(), time.perf_counter()
-    subprocess.run(words, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    carry_out(words)
     return time.perf_counter() - start, _processor_seconds() - before
 
 

@@ -12,7 +12,6 @@ import os
 import resource
 import shutil
 import sqlite3
-import subprocess
 import sys
 import time
 import tracemalloc
@@ -22,6 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from benchmarks.commands import carry_out
 from benchmarks.pages import machine, write_page
 from benchmarks.timing import ROUNDS, median_and_range
 
@@ -37,9 +37,7 @@ FILES = 100_000
 def framework(*words: str) -> tuple[float, float]:
     """Run a command; return its wall time and its processor time with all its processes, seconds."""
     before, start = _processor_seconds(), time.perf_counter()
-    subprocess.run(
-        [sys.executable, "-m", "framework", *words], cwd=ROOT, check=True, stdout=subprocess.DEVNULL
-    )
+    carry_out([sys.executable, "-m", "framework", *words])
     return time.perf_counter() - start, _processor_seconds() - before
 
 
