@@ -97,7 +97,7 @@ line of the following list names the random seeds, the density head, its configu
 failed:
 {chr(10).join(alarm_lines)}
 
-{machine("torch")} Command: `python -m benchmarks.framework.check`. Run time: {minutes:.0f} minutes.
+{machine("torch", "numpy")} Command: `python -m benchmarks.framework.check`. Run time: {minutes:.0f} minutes.
 """.replace("\n\n\n", "\n\n")
     write_page(__file__, text)
 
