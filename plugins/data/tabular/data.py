@@ -84,7 +84,7 @@ class Tabular(Data):
         self.path = path
         self._trained: InputColumns | None = None
         self.small_angles = small_angles
-        self.words = words
+        self.words: WordColumns = words
         self.writing = writing
         self.question = Question(names, kind, chosen, validation, test, data_seed, missing)
 

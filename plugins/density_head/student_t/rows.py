@@ -9,6 +9,7 @@ import torch
 from framework.density_head import DensityHead
 from framework.target import Target
 from framework.testing.rows import Case, HeadRow
+from plugins.density_head.student_t.head import StudentTHead
 
 ONE = Target("real", ("height",))
 TWO = Target("real", ("x", "y"))
@@ -33,7 +34,8 @@ def map_of_raw(raw: float) -> Any:
 
 def cases(head: DensityHead) -> Iterator[Case]:
     """Yield cases with location 0, many scales and, where they are predicted, many degrees of freedom."""
-    numbers, predicted, fixed = head.numbers, head.predicted, head.fixed  # type: ignore[attr-defined]
+    assert isinstance(head, StudentTHead)
+    numbers, predicted, fixed = head.numbers, head.predicted, head.fixed
     for log_scale in (-100.0, -9.0, -1.0, 0.0, 2.0, 40.0, 1e4):
         for log_freedom in (-100.0, -1.0, 0.0, 3.0, 100.0, 1e4) if predicted else (0.0,):
             raw = torch.zeros(len(OFFSETS), head.size, dtype=torch.float64)
@@ -42,7 +44,7 @@ def cases(head: DensityHead) -> Iterator[Case]:
             value = torch.tensor(OFFSETS, dtype=torch.float32).double()
             value = torch.stack([value.roll(number) for number in range(numbers)], -1)
             with mpmath.workdps(50):
-                scale = mpmath.mpf(head.floor) + map_of_raw(log_scale)  # type: ignore[arg-type]
+                scale = mpmath.mpf(head.floor) + map_of_raw(log_scale)
                 freedom = 3 + min(8 * map_of_raw(log_freedom), mpmath.mpf(10) ** 8) if predicted else fixed
                 log_prob = [float(exact(row, scale, freedom)) for row in value.tolist()]
             name = f"r = {log_scale:g}" + (f", {log_freedom:g}" if predicted else "")

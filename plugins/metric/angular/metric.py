@@ -39,7 +39,8 @@ class MeanAngularDeviation(Mean):
         target.require("angle", by="angular_deviation")
         self.names = ("maad_deg", *(f"maad_{name}_deg" for name in target.names))
         if 1 < len(target.names) <= FEW:  # the mean alone would hide the angle with the largest error
-            self.columns = {**self.columns, **{f"maad_{name}_deg": f"{name} MAAD °" for name in target.names}}
+            single = {f"maad_{name}_deg": f"{name} MAAD °" for name in target.names}
+            self.columns = {**self.columns, **single}  # pyright: ignore[reportAttributeAccessIssue]
         self.start(len(self.names))
 
     def update(self, prediction: Prediction) -> None:

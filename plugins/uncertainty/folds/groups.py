@@ -72,7 +72,7 @@ class Together(nn.Module):
 
     def losses_of_all(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch member"]:
         """Return the losses of all models for the same samples, nats."""
-        raw = torch.cat(self._raw(inputs), 1)
+        raw = torch.cat(list(self._raw(inputs)), 1)
         return self._head(0).loss(raw, _repeat(target, raw.shape[1]))
 
     def calibrate(self, batches: Sequence[Batch], fold: Sequence[Int[Tensor, "sample"]] | None) -> None:
