@@ -107,7 +107,8 @@ class Made:
             found["tempered"] = temper(found["mixture"], WARM)
         except UserError as error:
             # no density has this temperature, or none is registered
-        assert "cannot have the temperature" in str(error) or "protocol.tempered_density.register" in str(error)
+            said = str(error)
+            assert "cannot have the temperature" in said or "protocol.tempered_density.register" in said
         return found
 
     @property
@@ -328,7 +329,9 @@ def densities(kind: str, made: Made, density: Distribution, value: Tensor) -> No
         parts = [protocol.tempered_density(part, WARM) for part in made.parts]
     except UserError as error:
         # no density has this temperature, or none is registered
-        assert "cannot have the temperature" in str(error) or "protocol.tempered_density.register" in str(error)
+        assert "cannot have the temperature" in str(error) or "protocol.tempered_density.register" in str(
+            error
+        )
         return
     if kind != "floored":
         wanted = log_mixed(kind, made, lambda part, at: parts[made.parts.index(part)].log_prob(at))
@@ -630,7 +633,9 @@ def warm_of(density: Distribution, other: Distribution) -> list[tuple[Distributi
         return [(temper(density, WARM), temper(other, WARM))]
     except UserError as error:
         # no density has this temperature, or none is registered
-        assert "cannot have the temperature" in str(error) or "protocol.tempered_density.register" in str(error)
+        assert "cannot have the temperature" in str(error) or "protocol.tempered_density.register" in str(
+            error
+        )
         return []
 
 
