@@ -186,7 +186,7 @@ def test_a_sweep_begun_on_ray_is_finished_on_the_pool(ray_app: App) -> None:
     before = listening_beyond_loopback()
     process = ray_app.start("-m", ray_app.chosen, "what=ok,raise,once,hold")
     ray_app.until_ready(3)
-    wait_for(lambda: ray_app.record(2)["status"] == "died", 60)
+    wait_for(lambda: ray_app.record(2)["status"] == "died", PATIENCE)
     assert listening_beyond_loopback() <= before
     process.kill()
     process.wait()

@@ -186,6 +186,8 @@ class App:
                 env=self.environment,
                 stdout=output,
                 stderr=subprocess.STDOUT,
+                # a shell ignores SIGINT in its background jobs, as under nohup
+                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
             )
         self.processes.append(process)
         return process
