@@ -106,7 +106,8 @@ def _require(scene: Scene, channels: Collection[str], known: Collection[str]) ->
     unknown = sorted(set(channels) - set(known))
     if unknown:
         raise ValueError(
-            f"Got the channel {unknown[0]!r}, but the renderer example draws {', '.join(sorted(known))}. Request one of these."
+            f"Got the channel {unknown[0]!r}, but the renderer example draws "
+            f"{', '.join(sorted(known))}. Request one of these."
         )
     count = len(scene.vertices)
     if scene.faces.numel() and not (scene.faces.min() >= 0 and scene.faces.max() < count):
