@@ -57,9 +57,11 @@ class Ray:
 
     def _connect(self, settings: RaySettings) -> None:
         if settings.address is None:
-            # Ray 2.60 would listen on all addresses of this machine, without a password. It reads these variables
-            # when it is imported.
+            # Ray 2.60 would listen on all addresses of this machine, without a password, and would kill a job by
+            # SIGKILL when this command dies, often before the job has closed its run. It reads these variables when
+            # it is imported.
             os.environ |= {
+                "RAY_kill_child_processes_on_worker_exit": "0",
                 "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
                 "RAY_AUTH_MODE": "token",
                 "RAY_AUTH_TOKEN": secrets.token_hex(32),
