@@ -59,7 +59,9 @@ def map_npy(path: Path) -> NDArray:
     return np.frombuffer(pages, kind, count, start).reshape(shape, order=order)
 
 
-def _read_header(stream: BinaryIO, size: int) -> tuple[tuple[int, ...], Literal["C", "F"], np.dtype]:
+def _read_header(
+    stream: BinaryIO | io.BytesIO, size: int
+) -> tuple[tuple[int, ...], Literal["C", "F"], np.dtype]:
     """Return shape, order and type of the array in an .npy file of `size` bytes, and read only the header."""
     version = layout.read_magic(stream)
     if version not in HEADERS:
