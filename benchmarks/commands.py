@@ -1,8 +1,10 @@
 """Running commands of the framework from a benchmark script, in the project's folder."""
 
+import argparse
+import os
 import signal
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import FrameType
 
@@ -49,3 +51,15 @@ def carry_out(command: Sequence[str]) -> None:
         raise SystemExit(128 + received[0])
     if code:
         raise subprocess.CalledProcessError(code, command)
+
+
+def parse_step(description: str | None, steps: Iterable[str], folder_help: str) -> tuple[str, Path]:
+    """Return the step of a measurement that the command line names, and its folder; set one thread for all commands."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--folder", type=Path, required=True, help=folder_help)
+    parser.add_argument("step", choices=tuple(steps))
+    options = parser.parse_args()
+    os.environ["OMP_NUM_THREADS"] = "1"
+    return options.step, options.folder.absolute()

@@ -199,21 +199,6 @@ class Logistic(Distribution):
 estimate.register(Logistic, exact_estimate)
 
 
-@marginal.register
-def _(density: Logistic, index: int) -> Logistic:
-    return Logistic(density.place[..., index : index + 1], density.width[..., index : index + 1])
-
-
-@median.register
-def _(density: Logistic, samples: int) -> Tensor:
-    return density.place
-
-
-@pick.register
-def _(density: Logistic, index: Tensor) -> Logistic:
-    return Logistic(take(density.place, index), take(density.width, index))
-
-
 @marginal_cdfs.register
 def _(density: Logistic, value: Tensor) -> Tensor:
     return torch.sigmoid((value.double() - density.place.double()) / density.width.double())
@@ -292,20 +277,22 @@ class WrappedNormal(Distribution):
 estimate.register(WrappedNormal, exact_estimate)
 
 
+Located = Logistic | WrappedNormal
+
+
 @marginal.register
-def _(density: WrappedNormal, index: int) -> WrappedNormal:
-    here = slice(index, index + 1)
-    return WrappedNormal(density.place[..., here], density.width[..., here])
+def _(density: Located, index: int) -> Located:
+    return type(density)(density.place[..., index : index + 1], density.width[..., index : index + 1])
 
 
 @median.register
-def _(density: WrappedNormal, samples: int) -> Tensor:
+def _(density: Located, samples: int) -> Tensor:
     return density.place
 
 
 @pick.register
-def _(density: WrappedNormal, index: Tensor) -> WrappedNormal:
-    return WrappedNormal(take(density.place, index), take(density.width, index))
+def _(density: Located, index: Tensor) -> Located:
+    return type(density)(take(density.place, index), take(density.width, index))
 
 
 @arc_probability.register

@@ -75,14 +75,7 @@ class IndependentPoints:
     """Independent points, as a replacement for plugins.density_head.latent.monte_carlo.NormalPoints."""
 
     def __init__(
-        self,
-        items: int,
-        replicates: int,
-        dimensions: int,
-        *,
-        dtype: torch.dtype,
-        device: torch.device,
-        kept_count: int = 0,
+        self, items: int, replicates: int, dimensions: int, *, dtype: torch.dtype, **_: object
     ) -> None:
         self.shape, self.dtype, self.points = (replicates, items, dimensions), dtype, torch.empty(0)
 

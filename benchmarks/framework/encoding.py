@@ -8,9 +8,7 @@ compares the bytes, `files` encodes single files, and `page` writes encoding.md 
 GB) afterwards.
 """
 
-import argparse
 import json
-import os
 import random
 import resource
 import shutil
@@ -26,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.commands import carry_out
+from benchmarks.commands import carry_out, parse_step
 from benchmarks.pages import machine, write_page
 from benchmarks.timing import ROUNDS, median_and_range
 
@@ -239,21 +237,16 @@ def page(results: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    arguments = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    arguments.add_argument("--folder", type=Path, required=True, help="folder for the clouds and the results")
-    arguments.add_argument("step", choices=("make", "measure", "kill", "files", "page"))
-    options = arguments.parse_args()
-    folder, stored = options.folder.absolute(), options.folder.absolute().with_suffix(".json")
-    os.environ["OMP_NUM_THREADS"] = "1"
+    steps = {"measure": measure, "kill": kill, "files": files}
+    step, folder = parse_step(__doc__, ("make", *steps, "page"), "folder for the clouds and the results")
+    stored = folder.with_suffix(".json")
     results = json.loads(stored.read_text(encoding="utf-8")) if stored.is_file() else {}
-    if options.step == "make":
+    if step == "make":
         make(folder)
-    elif options.step == "page":
+    elif step == "page":
         write_page(__file__, page(results))
     else:
-        results |= {"measure": measure, "kill": kill, "files": files}[options.step](folder)
+        results |= steps[step](folder)
         stored.write_text(json.dumps(results), encoding="utf-8")
 
 

@@ -6,9 +6,7 @@ Each step measures one cost and keeps its numbers in the folder; `jobs` measures
 `page` writes scale.md beside this file. docs/scale.md says what follows from the numbers. Delete the folder afterwards.
 """
 
-import argparse
 import json
-import os
 import resource
 import shutil
 import sqlite3
@@ -21,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.commands import carry_out
+from benchmarks.commands import carry_out, parse_step
 from benchmarks.pages import machine, write_page
 from benchmarks.timing import ROUNDS, median_and_range
 
@@ -234,27 +232,20 @@ def page(measured: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    arguments = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    arguments.add_argument("--folder", type=Path, required=True, help="folder for inputs and results")
     steps = {"table": table, "store": store, "runs": runs, "clouds": clouds}
-    arguments.add_argument("step", choices=("jobs", *steps, "page"))
-    options = arguments.parse_args()
-    folder = options.folder.absolute()
+    step, folder = parse_step(__doc__, ("jobs", *steps, "page"), "folder for inputs and results")
     folder.mkdir(parents=True, exist_ok=True)
-    os.environ["OMP_NUM_THREADS"] = "1"
     stored = folder / "measured.json"
     measured = json.loads(stored.read_text(encoding="utf-8")) if stored.is_file() else {}
-    if options.step == "page":
+    if step == "page":
         write_page(__file__, page(measured))
-    elif options.step == "jobs":
+    elif step == "jobs":
         rounds = measured.setdefault("jobs", {"job": [], "repeated": []})
         for name, cost in jobs(folder).items():
             rounds[name].append(cost)
         stored.write_text(json.dumps(measured), encoding="utf-8")
     else:
-        measured |= steps[options.step](folder)
+        measured |= steps[step](folder)
         stored.write_text(json.dumps(measured), encoding="utf-8")
 
 

@@ -29,16 +29,9 @@ from mlflow.pyfunc.scoring_server import get_cmd
 
 from benchmarks.commands import carry_out
 from benchmarks.pages import machine, write_page
+from tests.test_loaded import QUICK
 
 STARTS, LATER = 5, 10
-QUICK = (
-    "encoder.mlp.widths=[8]",
-    "trainer.max_epochs=1",
-    "batch_size=8",
-    "pictures=false",
-    "logger=none",
-    "threads=1",
-)
 KINDS = {
     "tabular": ("tabular", ("density_head=categorical", "encoder=[mlp]", "metric=[accuracy]")),
     "images_with_angles": (

@@ -1,19 +1,34 @@
 """Base class of densities that are symmetric about one point and decrease on all sides of it."""
 
 from torch import Tensor
-from torch.distributions import Distribution
+from torch.distributions import Distribution, constraints
 
 from framework.distributions.description import one_line
 from framework.distributions.protocol import median
 
 
 class Symmetric(Distribution):
-    """Base class of densities whose mean, mode and median are their `location`, (*batch, *event)."""
+    """Base class of densities whose mean, mode and median are their `location`.
+
+    Args:
+        location: (*batch, *event).
+        event_dimensions: number of dimensions of an event.
+    """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
     __repr__ = one_line
 
     location: Tensor
+
+    def __init__(self, location: Tensor, event_dimensions: int = 1) -> None:
+        self.location = location
+        batch, event = location.shape[:-event_dimensions], location.shape[-event_dimensions:]
+        super().__init__(batch, event, validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint:
+        """Support of the density; the default is that of real numbers."""
+        return constraints.real_vector
 
     @property
     def mean(self) -> Tensor:

@@ -24,18 +24,9 @@ LIKE: dict[Callable[..., Tensor], Callable[..., Tensor]] = {
 }  # fmt: skip
 """Functions that draw a tensor shaped like another tensor, each with the function that draws one of a given shape."""
 IN_PLACE = {
-    getattr(Tensor, f"{name}_")
-    for name in (
-        "normal",
-        "uniform",
-        "bernoulli",
-        "exponential",
-        "log_normal",
-        "cauchy",
-        "geometric",
-        "random",
-    )
-}
+    Tensor.normal_, Tensor.uniform_, Tensor.bernoulli_, Tensor.exponential_, Tensor.log_normal_, Tensor.cauchy_,
+    Tensor.geometric_, Tensor.random_,
+}  # fmt: skip
 """Methods that fill a tensor with random numbers."""
 
 

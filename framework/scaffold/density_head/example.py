@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
-from torch.distributions import Distribution, constraints
 from torch.nn.functional import softplus
 
 from framework.density_head import DensityHead
-from framework.distributions.protocol import estimate, exact_estimate, marginal, median
+from framework.distributions.protocol import estimate, exact_estimate, marginal
+from framework.distributions.symmetric import Symmetric
 from framework.heads.parameters import require_finite
 from framework.target import Target
 
@@ -19,8 +19,10 @@ LARGEST = 1e18
 """Largest size of a raw parameter, so that no density overflows in float32."""
 
 
-class Laplace(Distribution):
+class Laplace(Symmetric):
     """Independent Laplace densities over the last dimension, exp(-|y - μ| / b) / (2 b).
+
+    The base class returns `location` as mean, mode and median.
 
     Args:
         location: μ, (*batch, number).
@@ -30,14 +32,8 @@ class Laplace(Distribution):
     def __init__(
         self, location: Float[Tensor, "*batch number"], scale: Float[Tensor, "*batch number"]
     ) -> None:
-        self.location = location
+        super().__init__(location)
         self.scale = scale
-        super().__init__(location.shape[:-1], location.shape[-1:], validate_args=False)
-
-    @property
-    def support(self) -> constraints.Constraint:
-        """Values that the density describes: vectors of real numbers."""
-        return constraints.real_vector
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log-density, nats."""
@@ -56,27 +52,12 @@ class Laplace(Distribution):
         return (1 + math.log(2) + self.scale.log()).sum(-1)
 
     @property
-    def mean(self) -> Tensor:
-        """Mean of each number, (*batch, number)."""
-        return self.location
-
-    @property
-    def mode(self) -> Tensor:
-        """Most likely values, (*batch, number)."""
-        return self.location
-
-    @property
     def variance(self) -> Tensor:
         """Variance of each number, (*batch, number)."""
         return 2 * self.scale.square()
 
 
 # framework.distributions.protocol lists everything that a density can register; the rest has defaults
-
-
-@median.register
-def _(density: Laplace, samples: int) -> Tensor:
-    return density.location
 
 
 @marginal.register

@@ -6,7 +6,6 @@ from functools import cached_property
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.distributions import constraints
 
 from framework.distributions import protocol
 from framework.distributions.exported import Exported, exported
@@ -35,15 +34,9 @@ class Gaussian(Symmetric):
         scale: Float[Tensor, "*batch number"],
         coefficients: Float[Tensor, "*batch number number"] | None = None,
     ) -> None:
-        self.location = mean
+        super().__init__(mean)
         self.scale = scale
         self.coefficients = coefficients
-        super().__init__(mean.shape[:-1], mean.shape[-1:], validate_args=False)
-
-    @property
-    def support(self) -> constraints.Constraint:
-        """Support of the density."""
-        return constraints.real_vector
 
     @property
     def variance(self) -> Tensor:

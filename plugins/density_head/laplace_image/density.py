@@ -39,9 +39,8 @@ class LaplaceImage(Symmetric):
     def __init__(
         self, location: Float[Tensor, "*batch height width number"], scale: Float[Tensor, "*any"]
     ) -> None:
-        self.location = location
+        super().__init__(location, event_dimensions=3)
         self.scale = scale.expand_as(location)
-        super().__init__(location.shape[:-3], location.shape[-3:], validate_args=False)
 
     @property
     def support(self) -> constraints.Constraint:

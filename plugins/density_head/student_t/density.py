@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.distributions import constraints
 
 from framework.distributions import protocol
 from framework.distributions.exported import Exported, exported
@@ -53,15 +52,9 @@ class StudentT(Symmetric):
         scale: Float[Tensor, "*batch number"],
         freedom: Float[Tensor, "*any"],
     ) -> None:
-        self.location = location
+        super().__init__(location)
         self.scale = scale
         self.freedom = freedom.to(location)
-        super().__init__(location.shape[:-1], location.shape[-1:], validate_args=False)
-
-    @property
-    def support(self) -> constraints.Constraint:
-        """Support of the density."""
-        return constraints.real_vector
 
     @property
     def variance(self) -> Tensor:

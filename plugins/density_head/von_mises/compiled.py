@@ -39,26 +39,25 @@ def multiply_add(typing, first, second, third):
     return first(first, first, first), generate
 
 
+def _same_bits(source: Any, kind: Any) -> tuple[Any, Callable[..., Any]]:
+    """Return the signature and the code of a function that reads the bits of a `source` as a `kind`."""
+
+    def generate(context: Any, builder: Any, sig: Any, values: Any) -> Any:
+        return builder.bitcast(values[0], context.get_value_type(kind))
+
+    return kind(source), generate
+
+
 @_intrinsic
 def bits_of(typing, number):
     """Return the integer of 32 or 64 bits that has the same bits as a floating-point number."""
-    kind = types.int32 if number == types.float32 else types.int64
-
-    def generate(context, builder, sig, values):
-        return builder.bitcast(values[0], context.get_value_type(kind))
-
-    return kind(number), generate
+    return _same_bits(number, types.int32 if number == types.float32 else types.int64)
 
 
 @_intrinsic
 def number_of(typing, bits):
     """Return the floating-point number that has the same bits as an integer of 32 or 64 bits."""
-    kind = types.float32 if bits == types.int32 else types.float64
-
-    def generate(context, builder, sig, values):
-        return builder.bitcast(values[0], context.get_value_type(kind))
-
-    return kind(bits), generate
+    return _same_bits(bits, types.float32 if bits == types.int32 else types.float64)
 
 
 @_intrinsic

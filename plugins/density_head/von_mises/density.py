@@ -52,9 +52,8 @@ class VonMises(Symmetric):
     def __init__(
         self, mean: Float[Tensor, "*batch angle"], concentration: Float[Tensor, "*batch angle"]
     ) -> None:
-        self.location = mean
+        super().__init__(mean)
         self.concentration = _in_range(concentration)
-        super().__init__(mean.shape[:-1], mean.shape[-1:], validate_args=False)
 
     @property
     def support(self) -> constraints.Constraint:

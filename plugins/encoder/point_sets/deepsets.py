@@ -7,12 +7,11 @@ from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor, nn
 
-from framework.encoder import Encoder
 from framework.geometry.clouds import Normalisation
 from plugins.encoder.point_sets.point_sets import (
+    CloudNetwork,
     Reading,
     count_columns,
-    encode_clouds,
     largest,
     repeat_for_points,
 )
@@ -21,7 +20,7 @@ Width = Annotated[int, Field(gt=0)]
 ACTIVATION = {"tanh": nn.Tanh, "elu": nn.ELU}
 
 
-class DeepSets(Encoder):
+class DeepSets(CloudNetwork):
     """Equivariant layers on each point's difference from the maximum over its cloud, then a maximum over the cloud.
 
     The equivariant layer is x ↦ σ(β + (x - 1 max x) Γ), as in the paper's network for clouds. The rows of x are the
@@ -74,12 +73,7 @@ class DeepSets(Encoder):
         self.whole = nn.Sequential(*after)
         self.output_shape = (length,)
 
-    def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
-        """Return the features of the clouds."""
-        dtype = next(self.parameters()).dtype
-        return encode_clouds(self._describe, inputs, self.reading, dtype, training=self.training)
-
-    def _describe(
+    def encode(
         self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
     ) -> Float[Tensor, "batch length"]:
         if torch.is_grad_enabled() and values.device.type == "cpu":

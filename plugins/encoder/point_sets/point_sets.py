@@ -1,5 +1,6 @@
-"""Functions that concatenate the points of a batch of clouds, and that compute maxima over each cloud."""
+"""Base class of networks on clouds, functions that concatenate the points of a batch, and maxima over each cloud."""
 
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -7,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from framework.encoder import Encoder
 from framework.errors import ConfigError
 from framework.geometry.clouds import Normalisation, normalise_clouds, require_clouds, sizes
 
@@ -53,30 +55,36 @@ class Reading(NamedTuple):
     normalise: Normalisation
 
 
-def encode_clouds(
-    network: Callable[[Tensor, Tensor], Tensor],
-    clouds: Float[Tensor, "batch points columns"],
-    reading: Reading,
-    dtype: torch.dtype,
-    *,
-    training: bool,
-    rows_per_point: int = 1,
-) -> Float[Tensor, "batch features"]:
-    """Return the features that a network computes from clouds, for few clouds at a time where possible.
+class CloudNetwork(Encoder):
+    """Base class of networks on the points of clouds, which compute few clouds at a time where possible.
 
-    Args:
-        network: function of concatenated points (from `concatenate_points`) and of the number of points of each cloud.
-        clouds: (batch, points, columns).
+    Attributes:
         reading: columns, points and normalisation that are read.
-        dtype: dtype of the points that the network reads.
-        training: whether the network needs the whole batch at once, as batch norm in training does.
         rows_per_point: as in `encode_in_parts`.
     """
-    columns, most, normalise = reading
-    values, counts = concatenate_points(clouds, normalise, columns=columns, most=most, dtype=dtype)
-    if training or torch.is_grad_enabled():
-        return network(values, counts)
-    return encode_in_parts(network, values, counts, rows_per_point)
+
+    reading: Reading
+    rows_per_point: int = 1
+
+    @abstractmethod
+    def encode(
+        self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
+    ) -> Float[Tensor, "batch length"]:
+        """Return the features of clouds.
+
+        Args:
+            values: concatenated points of the clouds (`concatenate_points`), in the dtype of the parameters.
+            counts: number of points of each cloud.
+        """
+
+    def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
+        """Return the features of the clouds."""
+        columns, most, normalise = self.reading
+        dtype = next(self.parameters()).dtype
+        values, counts = concatenate_points(inputs, normalise, columns=columns, most=most, dtype=dtype)
+        if self.training or torch.is_grad_enabled():  # batch norm in training needs the whole batch at once
+            return self.encode(values, counts)
+        return encode_in_parts(self.encode, values, counts, self.rows_per_point)
 
 
 def concatenate_points(
@@ -153,7 +161,7 @@ def encode_in_parts(
     batch norm in training needs the whole batch.
 
     Args:
-        network: as in `encode_clouds`.
+        network: function of concatenated points and of the number of points of each cloud.
         values: concatenated points.
         counts: number of points of each cloud.
         rows_per_point: approximate number of rows of numbers that the network computes for each point.

@@ -7,10 +7,9 @@ from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor, nn
 
-from framework.encoder import Encoder
 from framework.geometry.clouds import Normalisation
 from plugins.encoder.point_sets.layers import layers
-from plugins.encoder.point_sets.point_sets import Reading, count_columns, encode_clouds
+from plugins.encoder.point_sets.point_sets import CloudNetwork, Reading, count_columns
 from plugins.encoder.point_sets.pooled import largest_after
 
 Width = Annotated[int, Field(gt=0)]
@@ -18,7 +17,7 @@ LOCAL = 2
 """Number of layers that every point passes before its features are transformed."""
 
 
-class PointNet(Encoder):
+class PointNet(CloudNetwork):
     """Network that passes every point through the same layers and takes the maximum of each channel over the cloud.
 
     "full" also predicts two matrices from the cloud: a 3 × 3 matrix that every point is multiplied by, and a matrix
@@ -68,12 +67,7 @@ class PointNet(Encoder):
         self.dropout = nn.Dropout(dropout)
         self.output_shape = (widths[-1],)
 
-    def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
-        """Return the features of the clouds."""
-        dtype = next(self.parameters()).dtype
-        return encode_clouds(self._describe, inputs, self.reading, dtype, training=self.training)
-
-    def _describe(
+    def encode(
         self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
     ) -> Float[Tensor, "batch length"]:
         if self.input_matrix is not None:

@@ -8,12 +8,11 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
-from framework.encoder import Encoder
 from framework.geometry.clouds import Normalisation, pad, require_normalised, sizes
 from framework.geometry.farthest import farthest
 from plugins.encoder.point_sets.balls import find_within
 from plugins.encoder.point_sets.layers import layers
-from plugins.encoder.point_sets.point_sets import Reading, count_columns, encode_clouds, first_rows, largest
+from plugins.encoder.point_sets.point_sets import CloudNetwork, Reading, count_columns, first_rows, largest
 
 Count = Annotated[int, Field(gt=0)]
 
@@ -53,7 +52,7 @@ The distance is 1 for the published radius of 0.2.
 """
 
 
-class PointNet2(Encoder):
+class PointNet2(CloudNetwork):
     """Three PointNets in sequence: on small balls of points, on larger balls around fewer points, on the whole cloud.
 
     Centroids are points that are as far as possible from each other; the first one is the farthest from the mean of the
@@ -120,17 +119,9 @@ class PointNet2(Encoder):
         """Return the features of the clouds."""
         if self.reading.normalise == "none":
             require_normalised(inputs[..., :3], REACH * self.radius, sizes(inputs), by="encoder pointnet2")
-        dtype = next(self.parameters()).dtype
-        return encode_clouds(
-            self._describe,
-            inputs,
-            self.reading,
-            dtype,
-            training=self.training,
-            rows_per_point=self.rows_per_point,
-        )
+        return super().forward(inputs)
 
-    def _describe(
+    def encode(
         self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
     ) -> Float[Tensor, "batch length"]:
         values = order_by_distance(values, counts)

@@ -6,6 +6,7 @@ from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError
 from framework.geometry.clouds import pad
 from plugins.encoder.point_sets.deepsets import DeepSets, below_largest
+from plugins.encoder.point_sets.test_pointnet2 import read_points
 
 SMALL = {"channels": [8, 10, 12], "widths": [12, 8]}
 
@@ -18,11 +19,8 @@ def build_encoder(shape=(50, 3), **config):
 
 
 def by_hand(encoder, cloud, activation):
-    """Return the features of one cloud (points, columns) by loops in NumPy, float64, normalised as eq. 6.2."""
-    points = cloud.double().numpy().copy()
-    points[:, :3] -= points[:, :3].mean(0)
-    points[:, :3] /= np.sqrt((points[:, :3] ** 2).sum(1)).max()
-    points = points[: encoder.reading.most, : encoder.reading.columns]
+    """Return the features of one cloud (points, columns) by loops in NumPy, float64."""
+    points = read_points(encoder, cloud)
     for layer in encoder.equivariant:
         weight, bias = layer.weight.detach().double().numpy(), layer.bias.detach().double().numpy()
         most = points.max(0)

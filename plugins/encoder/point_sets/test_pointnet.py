@@ -1,6 +1,5 @@
 import math
 
-import numpy as np
 import pytest
 import torch
 
@@ -8,7 +7,7 @@ from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError
 from framework.geometry.clouds import pad
 from plugins.encoder.point_sets.pointnet import PointNet
-from plugins.encoder.point_sets.test_pointnet2 import apply_layers
+from plugins.encoder.point_sets.test_pointnet2 import apply_layers, read_points, require_agreement
 
 SMALL = {"point_widths": [8, 10, 8, 12], "widths": [12, 8], "dropout": 0.0}
 
@@ -27,11 +26,8 @@ def matrix(network, points):
 
 
 def by_hand(encoder, cloud):
-    """Return the features of one cloud (points, columns) in NumPy, float64, normalised as eq. 6.2."""
-    points = cloud.double().numpy().copy()
-    points[:, :3] -= points[:, :3].mean(0)
-    points[:, :3] /= np.sqrt((points[:, :3] ** 2).sum(1)).max()
-    points = points[: encoder.reading.most, : encoder.reading.columns]
+    """Return the features of one cloud (points, columns) in NumPy, float64."""
+    points = read_points(encoder, cloud)
     if encoder.input_matrix is not None:
         points[:, :3] = points[:, :3] @ matrix(encoder.input_matrix, points[:, :3])
     points = apply_layers(encoder.local, points)
@@ -47,12 +43,7 @@ def by_hand(encoder, cloud):
 def test_agrees_with_numpy_on_clouds_of_any_size(variant, columns, config):
     encoder = build_encoder((50, columns), variant=variant, **config)
     clouds = [torch.randn(number, columns) * 4 + 7 for number in (50, 1, 13, 30)]
-    wanted = np.stack([by_hand(encoder.double(), cloud) for cloud in clouds[:1] + clouds[2:]])
-    features = encoder(pad(clouds).double()).detach().numpy()
-    assert np.isfinite(features).all()
-    np.testing.assert_allclose(features[[0, 2, 3]], wanted, rtol=1e-9, atol=1e-9)
-    single = encoder.float()(pad(clouds)).detach().numpy()[[0, 2, 3]]
-    np.testing.assert_allclose(single, wanted, rtol=1e-4, atol=1e-5)
+    require_agreement(encoder, clouds, by_hand)
 
 
 def test_padding_does_not_enter_the_moments_of_batch_norm():

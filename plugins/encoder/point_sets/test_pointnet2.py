@@ -1,5 +1,6 @@
 import itertools
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -40,6 +41,25 @@ def apply_layers(layers, numbers):
     return numbers
 
 
+def read_points(encoder, cloud):
+    """Return the points of a cloud that an encoder reads, in NumPy, float64, normalised as eq. 6.2."""
+    points = cloud.double().numpy().copy()
+    points[:, :3] -= points[:, :3].mean(0)
+    points[:, :3] /= np.sqrt((points[:, :3] ** 2).sum(1)).max()
+    return points[: encoder.reading.most, : encoder.reading.columns]
+
+
+def require_agreement(encoder, clouds, by_hand):
+    """Require that an encoder returns what the function `by_hand` computes from each cloud of two or more points."""
+    rows = [row for row, cloud in enumerate(clouds) if len(cloud) > 1]
+    wanted = np.stack([by_hand(encoder.double(), clouds[row]) for row in rows])
+    features = encoder(pad(clouds).double()).detach().numpy()
+    assert np.isfinite(features).all()
+    np.testing.assert_allclose(features[rows], wanted, rtol=1e-9, atol=1e-9)
+    single = encoder.float()(pad(clouds)).detach().numpy()[rows]
+    np.testing.assert_allclose(single, wanted, rtol=1e-4, atol=1e-5)
+
+
 def order_by_distance(places, start):
     """Return an order in which each point is as far as possible from those before it, from all distances."""
     order = [start]
@@ -51,11 +71,8 @@ def order_by_distance(places, start):
 
 
 def by_hand(encoder, cloud, balls):
-    """Return the features of one cloud (points, columns) ball by ball in NumPy, float64, normalised as eq. 6.2."""
-    points = cloud.double().numpy().copy()
-    points[:, :3] -= points[:, :3].mean(0)
-    points[:, :3] /= np.sqrt((points[:, :3] ** 2).sum(1)).max()
-    points = points[: encoder.reading.most, : encoder.reading.columns]
+    """Return the features of one cloud (points, columns) ball by ball in NumPy, float64."""
+    points = read_points(encoder, cloud)
     mean = points[:, :3].mean(0)
     points = points[
         order_by_distance(points[:, :3], int(np.linalg.norm(points[:, :3] - mean, axis=1).argmax()))
@@ -80,11 +97,7 @@ def by_hand(encoder, cloud, balls):
 def test_agrees_with_numpy_on_clouds_of_any_size(grouping, columns, config):
     encoder = build_encoder((150, columns), grouping=grouping, **config)
     clouds = [torch.randn(number, columns) * 4 + 7 for number in (150, 2, 13, 30)]
-    wanted = np.stack([by_hand(encoder, cloud, BALLS[grouping]) for cloud in clouds])
-    features = encoder.double()(pad(clouds).double()).detach().numpy()
-    np.testing.assert_allclose(features, wanted, rtol=1e-9, atol=1e-9)
-    single = encoder.float()(pad(clouds)).detach().numpy()
-    np.testing.assert_allclose(single, wanted, rtol=1e-4, atol=1e-5)
+    require_agreement(encoder, clouds, partial(by_hand, balls=BALLS[grouping]))
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,6 @@ class Conformal(Uncertainty):
         score: Score = "density",
     ) -> None:
         super().__init__()
-        self.knobs = {}
         self.model = model()
         self.miscoverage = miscoverage
         self.score: Score = score

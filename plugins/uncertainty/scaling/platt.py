@@ -59,7 +59,6 @@ class Platt(Uncertainty):
     def __init__(self, model: Callable[[], Predictor], target: Target, *, smoothing: bool = True) -> None:
         super().__init__()
         target.require("class", by="uncertainty platt")
-        self.knobs = {}
         self.model = model()
         self.smoothing = smoothing
         self.register_buffer("slope", torch.ones((), dtype=torch.float64))

@@ -56,7 +56,6 @@ class Temperature(Uncertainty):
         upper: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 20.0,
     ) -> None:
         super().__init__()
-        self.knobs = {}
         self.model = model()
         self.lower = lower
         self.upper = upper

@@ -1,30 +1,28 @@
 """A density head on the circle that the framework does not ship."""
 
 import math
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import torch
 from pydantic import Field
 from torch import Tensor
-from torch.distributions import Distribution
 
 from framework.density_head import DensityHead
 from framework.distributions.circular import circular
-from framework.distributions.protocol import marginal, median
+from framework.distributions.protocol import marginal
+from framework.distributions.symmetric import Symmetric
 from framework.heads.parameters import require_finite
 from framework.target import Target
 
 
-class WrappedCauchy(Distribution):
+class WrappedCauchy(Symmetric):
     """Independent wrapped Cauchy densities (Mardia & Jupp 2000, eq. 3.5.66) over the last dimension."""
 
-    arg_constraints: ClassVar = {}
     support = circular
 
     def __init__(self, mean: Tensor, gap: Tensor) -> None:
-        self.location = mean
+        super().__init__(mean)
         self.gap = gap  # 1 - ρ, where ρ is the mean resultant length
-        super().__init__(mean.shape[:-1], mean.shape[-1:], validate_args=False)
 
     def log_prob(self, value: Tensor) -> Tensor:
         gap, length = self.gap, 1 - self.gap
@@ -39,15 +37,6 @@ class WrappedCauchy(Distribution):
 
     def entropy(self) -> Tensor:
         return (math.log(2 * math.pi) + torch.log(self.gap * (2 - self.gap))).sum(-1)
-
-    @property
-    def mode(self) -> Tensor:
-        return self.location
-
-
-@median.register
-def _(density: WrappedCauchy, samples: int) -> Tensor:
-    return density.location
 
 
 @marginal.register

@@ -41,26 +41,14 @@ class Committee(Uncertainty):
             member.calibrate(kept)
 
 
-class AveragedCommittee(Uncertainty):
+class AveragedCommittee(Committee):
     """Wrapper that averages directions, which the contract forbids: with one member it does not return that member's
     density."""
-
-    bibtex = ""
-
-    def __init__(self, model: Callable[[], Predictor], *, members: Annotated[int, Field(ge=1)] = 3) -> None:
-        super().__init__()
-        self.members = nn.ModuleList(model() for _ in range(members))
 
     def forward(self, inputs: Tensor) -> Distribution:
         densities = [member(inputs) for member in self.members]
         places = torch.stack([density.location for density in densities])
         return type(densities[0])(torch.atan2(places.sin().mean(0), places.cos().mean(0)))
-
-    def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
-        return torch.stack([member.loss(inputs, target) for member in self.members]).mean(0)
-
-    def training_densities(self, inputs: Tensor) -> Distribution:
-        return self(inputs)
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
         pass
