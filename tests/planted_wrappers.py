@@ -16,7 +16,7 @@ from framework.distributions.protocol import cdf, median
 from framework.distributions.tempering import temper
 from framework.model import Predictor, independent_penalty
 from framework.target import Target
-from framework.uncertainty import Uncertainty
+from framework.uncertainty import SelfTraining, Uncertainty
 from tests.planted_heads import CLASSES, HEIGHT, ONE, PLACE, Changed
 
 TEMPERATURES = torch.logspace(-1, 1.3, 24, dtype=torch.float64)
@@ -267,6 +267,16 @@ class KnobsDescend(Tempered):
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"passes": (3, 1)}
 
 
+class TrainsUnseeded(Tempered, SelfTraining):
+    """Trains its model itself, with numbers of torch's global generator."""
+
+    def train_models(self, inputs: Tensor, target: Tensor, *, seed: int, batch_size: int) -> float:
+        with torch.no_grad():
+            for parameter in self.parameters():
+                parameter.add_(0.1 * torch.randn(parameter.shape))
+            return self.loss(inputs, target).mean().item()
+
+
 @dataclass(frozen=True)
 class Fault:
     """A wrapper with one planted fault.
@@ -329,6 +339,7 @@ ALL_FAULTS = (
     Fault("temperature is not stored", NotStored, CLASSES, "state-dict round trip"),
     Fault("float32 once calibrated", Single, CLASSES, "number types"),
     Fault("knobs descend", KnobsDescend, CLASSES, "knobs can be set"),
+    Fault("trains with the global generator", TrainsUnseeded, CLASSES, "trains its models itself"),
 )  # fmt: skip
 
 RIGHT: Mapping[str, Callable[[Callable[[], Predictor]], Uncertainty]] = {

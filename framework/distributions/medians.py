@@ -9,39 +9,38 @@ from framework.distributions import protocol
 
 ROUNDS = 100
 """Largest number of steps; Newton's method needs three to six, and bisection alone 60."""
-TOLERANCE = 1e-9
-"""Largest last step, as a share of the width of the density."""
+TOLERANCE = 1e-6
+"""Largest difference of F from ½ before the last step, after which it is about the square of this number."""
 
 
 @torch.no_grad()
 def median_of_real(density: Distribution) -> Float[Tensor, "*batch 1"] | None:
     """Return the median of densities of one real number; None if their distribution function is not known.
 
-    The median is the root of F(x) = ½ by Newton's method, whose steps stay in a bracket. The bracket begins at the
-    smallest and the largest mode candidate, between which the median of symmetric components lies.
+    The median is the root of F(x) = ½ by Newton's method, which begins at the mean of the mode candidates. If a step
+    leaves the bracket of the root, the bracket is halved instead.
     """
-    places = protocol.mode_candidates(density)
-    low, high = places.amin(0).double(), places.amax(0).double()
-    below, above = protocol.cdf(density, low), protocol.cdf(density, high)
-    if below is None or above is None or not bool((below.isfinite() & above.isfinite()).all()):
-        return None
-    if bool((below > 0.5).any()) or bool((above < 0.5).any()):
-        low, high = _widen(density, low, high)
-    value = (low + high) / 2
+    places = protocol.mode_candidates(density).double()
+    low, high, value = places.amin(0), places.amax(0), places.mean(0)
+    bracketed = False
     for _ in range(ROUNDS):
         share = protocol.cdf(density, value)
-        assert share is not None
+        if share is None or not bool(share.isfinite().all()):
+            return None
         gap = share.unsqueeze(-1) - 0.5
-        low, high = torch.where(gap < 0, value, low), torch.where(gap > 0, value, high)
         height = density.log_prob(value).double().exp().unsqueeze(-1)
         step = value - gap / height
         inside = (step >= low) & (step <= high)  # false where the density is 0 or infinite
-        following = torch.where(inside, step, (low + high) / 2)
-        moved = (following - value).abs() * height
-        value = following
-        if not bool((moved > TOLERANCE).any()):
+        if not bracketed and not bool(inside.all()):
+            low, high = _widen(density, low, high)
+            bracketed = True
+            inside = (step >= low) & (step <= high)
+        low, high = torch.where(gap < 0, value, low), torch.where(gap > 0, value, high)
+        wrong = gap.abs() > TOLERANCE
+        value = torch.where(inside, step, torch.where(wrong, (low + high) / 2, value))
+        if not bool(wrong.any()):
             break
-    return value.to(places.dtype)
+    return value.to(protocol.mode_candidates(density).dtype)
 
 
 def _widen(density: Distribution, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:

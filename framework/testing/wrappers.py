@@ -23,7 +23,7 @@ from framework.testing.heads import check_knobs
 from framework.testing.plain import Build, Plain, inputs, wrapped_models
 from framework.testing.protocol_checks import protocol_calls
 from framework.testing.rows import WrapperRow
-from framework.uncertainty import Uncertainty
+from framework.uncertainty import SelfTraining, Uncertainty, held_out
 
 Make = Callable[[], Uncertainty]
 
@@ -60,6 +60,7 @@ def examine_wrapper(
             lambda worst: _round_trip(make, lambda: build(row.target), row, worst),
         ),
         "calibration": (0.0, lambda worst: _calibration(make, row, worst)),
+        "trains its models itself": (0.0, lambda worst: _trains_itself(make, row, worst)),
     }
     calibration = Calibration(row, build)
     checks |= {name: (limit, check) for name, limit, check in calibration.checks()}
@@ -377,6 +378,35 @@ def _calibration(make: Make, row: WrapperRow, worst: Worst) -> None:
         with torch.no_grad():
             log_prob = wrapper(inputs(5)).log_prob(values(row.target, (5,)))
         worst.finite(f"log_prob after calibrate, targets {label_kind}", log_prob)
+
+
+def _trains_itself(make: Make, row: WrapperRow, worst: Worst) -> None:
+    """Check a wrapper that trains its models itself (`SelfTraining`): repeatable training, and held-out predictions.
+
+    The training must change every wrapped model and no global random state. The mean loss that it returns must be
+    finite, and held-out predictions must exist for every sample.
+    """
+    features, target = inputs(60), values(row.target, (60,))
+    losses, log_probs = [], []
+    for _ in range(2):
+        wrapper = make()
+        if not isinstance(wrapper, SelfTraining):
+            worst.count(False, "the wrapper does not train its models itself")
+            return
+        before = [parameter.detach().clone() for parameter in wrapper.parameters()]
+        state = torch.get_rng_state()
+        losses.append(torch.tensor(wrapper.train_models(features, target, seed=SEED, batch_size=16)))
+        worst.count(not torch.equal(torch.get_rng_state(), state), "training changes torch's random state")
+        same = [torch.equal(old, new) for old, new in zip(before, wrapper.parameters(), strict=True)]
+        worst.count(all(same), "training changes no parameter")
+        wrapper.eval()
+        with torch.no_grad(), held_out(wrapper, {"row": torch.arange(50, 60)}):
+            log_probs.append(wrapper(features[50:]).log_prob(target[50:]))
+        worst.same("shape of held-out log_prob of 10 samples", tuple(log_probs[-1].shape), (10,))
+    worst.finite("mean loss of samples that a model did not see", losses[0])
+    worst.same_bits("mean loss of a second training with the same seed", losses[1], losses[0])
+    worst.finite("held-out log_prob", log_probs[0])
+    worst.same_bits("held-out log_prob after a second training", log_probs[1], log_probs[0])
 
 
 def _equal_targets(row: WrapperRow) -> list[Batch]:

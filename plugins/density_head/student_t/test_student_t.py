@@ -138,7 +138,9 @@ def test_the_median_of_a_mixture_is_exact():
     location, scale = 3 * torch.randn(50, 4, 1).double(), torch.rand(50, 4, 1).double() + 0.01
     mixture = Mixture(torch.randn(50, 4).double(), StudentT(location, scale, torch.tensor([5.0]).double()))
     nested = Mixture(torch.zeros(50, 2).double(), Stacked([mixture, mixture]))
-    for density in (mixture, nested):
+    # densities so narrow that there is almost nothing between them
+    far = StudentT(100 * location, 0.01 * scale, torch.tensor([30.0]).double())
+    for density in (mixture, nested, Mixture(torch.randn(50, 4).double(), far)):
         value = median(density, 10)
         assert torch.equal(median(density, 10), value)
         torch.testing.assert_close(cdf(density, value), torch.full((50,), 0.5).double(), rtol=0, atol=1e-9)

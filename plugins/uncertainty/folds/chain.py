@@ -9,6 +9,8 @@ from torch import Tensor, nn
 
 POINTWISE = (nn.ReLU, nn.ELU, nn.SiLU)
 """Layers that change each number on its own and have no weights."""
+ROWS = 128
+"""Number of samples that are computed at once without gradient, so that the outputs of a layer stay in the cache."""
 POOL = 2**20
 """Number of dropout decisions that are drawn at once, beyond those of one layer.
 
@@ -51,6 +53,11 @@ class Chain(nn.Module):
         dtype = self.weights[0].dtype
         numbers = inputs.to(dtype) / 255 if inputs.dtype == torch.uint8 else inputs.to(dtype)
         numbers = numbers.expand(self.members, *inputs.shape) if inputs.dim() == 2 else numbers
+        if torch.is_grad_enabled() or torch.compiler.is_exporting() or numbers.shape[1] <= ROWS:
+            return self._compute(numbers)
+        return torch.cat([self._compute(part) for part in numbers.split(ROWS, 1)], 1)
+
+    def _compute(self, numbers: Float[Tensor, "member batch length"]) -> Float[Tensor, "member batch size"]:
         layer = 0
         for step in self.steps:
             if isinstance(step, nn.Linear):

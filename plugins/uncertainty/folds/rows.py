@@ -7,14 +7,15 @@ it, so that there are at least two models.
 from framework.target import Target
 from framework.testing.rows import WrapperRow
 
+SHORT = {"steps": 10, "epochs": 1}
 ROWS = {
     "folds": (
-        WrapperRow("reals", Target("real", ("x", "y")), {"folds": 2}),
-        WrapperRow("classes", Target("class", ("a", "b", "c")), {"folds": 3}),
+        WrapperRow("reals", Target("real", ("x", "y")), {"folds": 2, **SHORT}),
+        WrapperRow("classes", Target("class", ("a", "b", "c")), {"folds": 3, **SHORT}),
         WrapperRow(
             "one angle, one group",
             Target("angle", ("azimuth",)),
-            {"folds": 2, "dropout": [0.2], "weight_decay": [0.0]},
+            {"folds": 2, "dropout": [0.2], "weight_decay": [0.0], **SHORT},
         ),
     )
 }

@@ -15,7 +15,7 @@ BETAS = (0.9, 0.99)
 """Decay rates of the moments in AdamW."""
 WARMUP = 0.02
 """Share of the steps in which the learning rate rises linearly."""
-VALIDATIONS = 60
+VALIDATIONS = 40
 """Number of times that the losses of the left-out folds are computed during training."""
 MOST_STEPS = 20_000
 """Largest number of steps; a larger table is passed fewer times."""

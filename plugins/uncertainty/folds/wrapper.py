@@ -75,7 +75,7 @@ class Folds(Uncertainty, SelfTraining):
         weight_decay: list[Decay] = [0.1, 0.3],  # noqa: B006 - never written
         learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3e-3,
         steps: Annotated[int, Field(ge=1)] = 3000,
-        epochs: Annotated[int, Field(ge=1)] = 40,
+        epochs: Annotated[int, Field(ge=1)] = 45,
     ) -> None:
         super().__init__()
         if len(dropout) != len(weight_decay) or not dropout:
