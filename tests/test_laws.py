@@ -15,7 +15,7 @@ CORE = sorted((ROOT / "framework").rglob("*.py"))
 PLUGINS = sorted(path for path in (ROOT / "plugins").rglob("*.py") if path.parent != ROOT / "plugins")
 
 
-MATHEMATICS = {"points", "projection", "temperature", "mixture", "categorical", "bernoulli"}
+MATHEMATICS = {"points", "projection", "temperature", "mixture", "categorical", "bernoulli", "quantiles"}
 """Entry points whose names are mathematical terms, which the framework may use."""
 
 
@@ -182,6 +182,7 @@ NOT_IN_THE_THESIS = {
     "density_head/bernoulli_image",
     "density_head/fit_pose",
     "density_head/laplace_image",
+    "density_head/quantiles",
     "density_head/student_t",
     "encoder/normal_scores",
     "metric/coverage",

@@ -108,6 +108,9 @@ def _compare_units(
     with torch.no_grad():
         head.calibrate(raw, value)
         alone.calibrate(raw, standard)
+        # new values, because the calibrated density may jump at the values that calibrated it
+        standard = _call_seeded(lambda: alone(raw).sample()).double()
+        value = location + scale * standard
         actual, expected = (
             _call_seeded(lambda model=model, targets=targets: model(raw).log_prob(targets)).double()
             for model, targets in ((head, value), (alone, standard))

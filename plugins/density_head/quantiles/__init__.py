@@ -1,0 +1,1 @@
+"""Densities given by quantiles, and their head."""
