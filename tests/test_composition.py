@@ -135,6 +135,7 @@ def test_an_experiment_of_each_family_can_be_shortened(name: str) -> None:
 
 SHORTER = {
     "modelnet40/": "batch_size=4",
+    "modelnet40/pointnet2": "encoder.pointnet2.width=0.25",
     "modelnet40/bps_conv3d_ensemble": "uncertainty.ensemble.members=2",
     "rasterizer/fit_pose": "density_head.steps=3",
 }

@@ -47,6 +47,12 @@ OFTEN = {
     "folds": ("real",),
 }
 """Kinds of targets that are always tested for each wrapper; the other kinds are slow tests."""
+SHORT = {
+    "ensemble": ("uncertainty.ensemble.members=2",),
+    "mc_dropout": ("uncertainty.mc_dropout.samples=5",),
+    "folds": ("uncertainty.folds.folds=2", "uncertainty.folds.steps=60", "uncertainty.folds.epochs=2"),
+}
+"""Settings of wrappers that shorten a run."""
 PROMISED = 0.8
 
 
@@ -78,12 +84,8 @@ def trained(framework: Framework, table: Path, kind: str, chain: str) -> Done:
         *("metric=[log_likelihood,prediction_set]", f"uncertainty={chain}"),
         *(f"uncertainty.conformal.miscoverage={1 - PROMISED:g}", "samples=200", "logger=none"),
         *("pictures=false", "threads=1"),
-        *(("uncertainty.ensemble.members=2",) if "ensemble" in chain else ()),
-        *(
-            ("uncertainty.folds.steps=60", "uncertainty.folds.epochs=2")
-            if "folds" in chain
-            else ("trainer.max_epochs=2",)
-        ),
+        *next((settings for wrapper, settings in SHORT.items() if wrapper in chain), ()),
+        *(() if "folds" in chain else ("trainer.max_epochs=2",)),
     )
     assert done.code == 0, done.out
     return done

@@ -141,7 +141,7 @@ def test_a_preset_is_what_the_thesis_says(experiment: str) -> None:
     "experiment",
     [
         "modelnet40/bps_mlp_400",
-        pytest.param("modelnet40/bps_conv3d", marks=pytest.mark.slow),
+        pytest.param("modelnet40/bps_conv3d batch_size=4", marks=pytest.mark.slow),
         pytest.param(
             "pascal3d/von_mises data.image_size=75 data.images=60 batch_size=2 "
             "encoder.inception_resnet_v2.weights=null",

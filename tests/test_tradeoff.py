@@ -386,7 +386,7 @@ def test_the_file_holds_every_number_under_a_key_with_its_unit(
 @pytest.mark.slow
 def test_metrics_and_errors_against_a_reference_are_measured_together() -> None:
     angle = Target("angle", ("azimuth",))
-    whole = predictor({"name": "mc_dropout"}, head="scvae", target=angle)
+    whole = predictor({"name": "mc_dropout"}, head={"name": "scvae", "samples": 20}, target=angle)
     fields = [{**batch, "target": batch["input"][:, :1]} for batch in batches()]
     metric = build("metric", resolve("metric", "angular_deviation"), target=angle)
     options = {"knob": "samples", "values": (1, 20), "repeats": 3, "timed_calls": 1}
