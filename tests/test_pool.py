@@ -7,17 +7,18 @@ import signal
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from framework.errors import ConfigError
+from framework.errors import ConfigError, DataError, UserError
 from framework.runs.job import write_value
-from framework.sweeps import engines
+from framework.sweeps import engines, sending
 from framework.sweeps import jobs as sweep
+from framework.tracking import ended
 from tests.conftest import imported_by, wait_for
 
 LINUX = pytest.mark.skipif(
@@ -590,3 +591,39 @@ def test_the_launcher_costs_other_commands_nothing() -> None:
         "framework.sweeps.comparison",
     }
     assert not heavy & imported_by("hydra_plugins.framework_pool")
+
+
+def test_journals_that_the_store_did_not_accept_are_sent_again_while_a_sweep_runs_and_at_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    accepted = [list[str]() for _ in range(3)]
+    tries = Counter[str]()
+
+    def run(number: int, accepts: Callable[[str], bool], *names: str) -> None:
+        def sync(folder: Path, store: str | None) -> None:
+            tries[folder.name] += 1
+            if folder.name == "damaged":
+                raise DataError("this journal is damaged")
+            if not accepts(folder.name):
+                raise UserError("The store is away.")
+            accepted[number].append(folder.name)
+
+        monkeypatch.setattr(ended, "sync", sync)
+        tries.clear()
+        with sending.JournalSender(None) as sender:
+            for name in names:
+                sender.add(tmp_path / name)
+
+    monkeypatch.setattr(sending, "_is_sent", lambda folder: False)
+    monkeypatch.setattr(sending, "_FIRST_RETRY", 0.01)
+    monkeypatch.setattr(sending, "PATIENCE", 0.1)
+    run(0, lambda name: tries[name] > 2, "a", "b", "damaged")
+    assert (sorted(accepted[0]), tries["damaged"]) == (["a", "b"], 1)
+    assert caplog.text.count("The sweep tries again") == 1
+    assert "this journal is damaged" in caplog.text
+    run(1, lambda name: name != "a", "a", "b")
+    assert accepted[1] == ["b"], "a job that the store refuses holds up the others"
+    assert (
+        f"incomplete in the tracking store: 1. The store is away. The command for all of them: `python -m framework "
+        f"mode=sync mode.run={tmp_path / 'a'}`" in caplog.text
+    )

@@ -1,26 +1,45 @@
-"""mode=sync: send to the tracking store the journal lines that a run could not send itself."""
+"""mode=sync: send to the tracking store the journal lines that runs could not send themselves."""
 
 from pathlib import Path
 
 from rich.console import Console
 
 from framework.configuration.config import Config, Options
-from framework.errors import ConfigError
+from framework.errors import ConfigError, UserError
+from framework.runs.job import find_job_folders
 from framework.tracking.ended import sync
 
 
 class SyncOptions(Options):
-    """Options of mode=sync: the folder of the run whose journal is sent."""
+    """Options of mode=sync: the folder of the run, or of the sweep, whose journals are sent."""
 
     run: str
 
 
 def run(config: Config) -> None:
-    """Send the journal of `mode.run`, and print the number of lines sent."""
+    """Send the journal of the run in `mode.run` and those of a sweep's jobs, and print the number of lines sent.
+
+    Raises:
+        ConfigError: There is no run.
+        UserError: A journal could not be sent; the others were sent.
+    """
     folder = Path(config.options(SyncOptions).run).expanduser()
-    if not (folder / "run.json").is_file():
+    jobs = [job for job in find_job_folders(folder) if job != folder]
+    runs = [run for run in (folder, *jobs) if (run / "run.json").is_file()]
+    if not runs:
         raise ConfigError(
             f"mode.run={folder} is no run folder, because {folder / 'run.json'} does not exist. Set mode.run to the "
-            "folder of a run."
+            "folder of a run or of a sweep."
         )
-    Console().print(f"{sync(folder, config.settings.logger.uri)} journal lines sent from {folder}.")
+    errors: list[UserError] = []
+    for run in runs:
+        try:
+            lines = sync(run, config.settings.logger.uri)
+        except UserError as error:
+            errors.append(error)
+        else:
+            Console().print(f"{lines} journal lines sent from {run}.")
+    if len(errors) == 1:
+        raise errors[0]
+    if errors:
+        raise UserError("\n".join(map(str, errors)))

@@ -10,9 +10,7 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,7 +24,8 @@ from framework.storage.plain_values import plain_numbers
 from framework.storage.reading import translate_errors
 from framework.sweeps.engines import CONSOLE, LOCK, Engine
 from framework.sweeps.processes import Process
-from framework.tracking.signals import CLOSED, ENDING, SIGNALS, Stopped, ends_with_parent, handled_signals
+from framework.sweeps.sending import JournalSender
+from framework.tracking.signals import CLOSED, ENDING, SIGNALS, Stopped, collected_signals, ends_with_parent
 
 COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework")
 """Command of a job, to which its overrides are added. It is no setting, because a config must not run code."""
@@ -166,7 +165,7 @@ def run(
     retries: int = 0,
     devices: Sequence[str] = (),
     parent: str | None = None,
-    store: str | None = None,
+    sender: JournalSender | None = None,
     eager: bool = False,
     watch: Callable[[Job], None] | None = None,
 ) -> None:
@@ -185,7 +184,7 @@ def run(
         retries: Number of times that a job that died is started again.
         devices: CUDA devices to distribute, one to each running job; if empty, all jobs see all devices.
         parent: Id of the tracking run under which the jobs are recorded.
-        store: Address of the tracking store that the command names.
+        sender: Object that sends the journals of ended jobs to the tracking store; None without a store.
         eager: Return as soon as every job has been started and no ended job is left unnoticed. The jobs must outlive
             this process.
         watch: Function that is called for each running job in turn, about every `engine.interval` seconds.
@@ -210,7 +209,11 @@ def run(
     running: list[_Running] = []
     passed_on = 0
     started_by, orphaned_at = os.getppid(), None
-    with _signals() as received, ThreadPoolExecutor(1, "sync") as sending:
+    if sender is not None:
+        for job in jobs:
+            if job.completed:  # the command that ran the job may have been killed before it sent the journal
+                sender.add(job.folder)
+    with collected_signals() as received:
         while running or (queue and not received):
             if engine.outlives and received[:1] == [CLOSED]:
                 log.info(f"The terminal is closed: {len(running)} jobs go on without this command")
@@ -265,8 +268,8 @@ def run(
                 if active.lock is None and not job.is_elsewhere:
                     continue  # another sweep has recorded how the job ended
                 _end(active, code)
-                if parent is not None:
-                    sending.submit(_sync, job.folder, store)
+                if sender is not None:
+                    sender.add(job.folder)
                 if job.record["status"] == "died" and not received:
                     job.losses += active.process.lost
                     if job.attempts - job.losses <= retries and job.losses <= MOST_LOSSES:
@@ -276,16 +279,6 @@ def run(
             time.sleep(engine.interval)
     if received:
         raise Stopped(received[0])
-
-
-def _sync(folder: Path, store: str | None) -> None:
-    """Send the journal lines that a finished job has not sent; `comparison` closes and sends runs of killed jobs."""
-    from framework.tracking.ended import sync  # imported late: Hydra imports this module at every start
-
-    try:
-        sync(folder, store)
-    except UserError as error:
-        log.warning(f"{folder}: {error}")
 
 
 def failure(jobs: Sequence[Job]) -> UserError | None:
@@ -428,19 +421,6 @@ def _pass_on(number: int, before: int, running: Sequence[_Running]) -> None:
         else:
             active.process.kill()
     log.info(f"{signal.Signals(number).name}: {len(running)} running jobs are asked to stop")
-
-
-@contextmanager
-def _signals() -> Iterator[list[int]]:
-    """Collect signals inside the `with` block; yield the list to which the number of each received signal is added."""
-    received: list[int] = []
-    numbers = handled_signals()
-    before = [signal.signal(number, lambda number, frame: received.append(number)) for number in numbers]
-    try:
-        yield received
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
 
 
 def _lock(job: Job) -> int | None:

@@ -353,7 +353,15 @@ def _open_client(info: RunInfo) -> tuple[MlflowClient, str]:
     path = sqlite_path(info.uri)
     if path is None:
         client = MlflowClient(tracking_uri=info.uri)
-        return client, _experiment(client, info)
+        try:
+            return client, _experiment(client, info)
+        except MlflowException as error:
+            if error.error_code != "UNAUTHENTICATED":
+                raise
+        raise RuntimeError(  # after the block, because `reason` reports the first error of a chain
+            "the server refuses the user name or the password, which MLFLOW_TRACKING_USERNAME and "
+            "MLFLOW_TRACKING_PASSWORD give"
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     if not info.named:
         require_own_files(info.uri)

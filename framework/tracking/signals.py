@@ -25,6 +25,19 @@ def handled_signals() -> tuple[signal.Signals, ...]:
     )
 
 
+@contextmanager
+def collected_signals() -> Iterator[list[int]]:
+    """Collect signals inside the `with` block; yield the list to which the number of each received signal is added."""
+    received: list[int] = []
+    numbers = handled_signals()
+    before = [signal.signal(number, lambda number, frame: received.append(number)) for number in numbers]
+    try:
+        yield received
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
 class Stopped(SystemExit):
     """Exception for a run that a signal stops; the process exits with 128 + the signal's number, as in shells."""
 

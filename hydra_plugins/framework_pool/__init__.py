@@ -24,6 +24,7 @@ from framework.storage.enclosed import require_enclosed
 from framework.storage.files import hold_lock
 from framework.sweeps import jobs as sweep
 from framework.sweeps.engines import Engine, Pool, cores
+from framework.sweeps.sending import JournalSender
 
 log = logging.getLogger(__name__)
 
@@ -65,6 +66,7 @@ class EngineLauncher(Launcher):
         self._watch: Callable[[sweep.Job], None] | None = None
         self._search: ExitStack | None = None  # what ends with the `batches` block
         self._search_engine: Engine | None = None
+        self._search_sender: JournalSender | None = None
 
     def _check(self) -> None:
         """Raise a ConfigError if the engine is not installed or a setting is wrong; called before any job starts."""
@@ -115,6 +117,7 @@ class EngineLauncher(Launcher):
         with ExitStack() as stack:
             if self._search is None:
                 stack.callback(self._summarise, folder, values[0])
+            sender = self._sender_of(comparison.store_of(values[0]), stack)
             sweep.run(
                 jobs,
                 self._engine_of(jobs, values, stack),
@@ -122,7 +125,7 @@ class EngineLauncher(Launcher):
                 retries=self.retries,
                 devices=self.devices,
                 parent=self.parent,
-                store=comparison.store_of(values[0]),
+                sender=sender,
                 eager=self.eager,
                 watch=self._watch,
             )
@@ -149,7 +152,7 @@ class EngineLauncher(Launcher):
             with ExitStack() as self._search:
                 yield
         finally:
-            self._watch = self._search = self._search_engine = None
+            self._watch = self._search = self._search_engine = self._search_sender = None
 
     def check(
         self, job_overrides: Sequence[Sequence[str]], first: int = 0
@@ -194,6 +197,16 @@ class EngineLauncher(Launcher):
         if self._search_engine is None:
             self._search_engine = self._search.enter_context(closing(self._engine(jobs, values)))
         return self._search_engine
+
+    def _sender_of(self, store: str | None, stack: ExitStack) -> JournalSender | None:
+        """Return what sends the journals of a batch, which ends with `stack` or, in a search, with the search."""
+        if self.parent is None:
+            return None
+        if self._search is None:
+            return stack.enter_context(JournalSender(store))
+        if self._search_sender is None:
+            self._search_sender = self._search.enter_context(JournalSender(store))
+        return self._search_sender
 
     def _summarise(self, folder: Path, config: Mapping[str, Any]) -> None:
         from framework.sweeps import comparison
