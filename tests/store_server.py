@@ -57,8 +57,9 @@ class StoreServer:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.programs = _programs()
-        assert self.programs is not None
+        programs = _programs()
+        assert programs is not None
+        self.programs = programs
         database_port, self.port = _free_ports(2)
         # words without a special meaning in an address
         self._password, password = secrets.token_hex(8), secrets.token_hex(8)
@@ -152,7 +153,16 @@ class StoreServer:
     def memory_megabytes(self) -> tuple[float, float]:
         """Return the proportional memory of the processes of the MLflow server and of the database, MB (Linux)."""
         assert self._server is not None
-        return tuple(_memory(pid) for pid in (self._server.pid, self._database))  # type: ignore[return-value]
+        server, database = (
+            sum(_megabytes(process, "smaps_rollup", "Pss") for process in _family(pid))
+            for pid in (self._server.pid, self._database)
+        )
+        return server, database
+
+    def peak_megabytes(self) -> float:
+        """Return the largest memory that a process of the MLflow server has had so far, MB (Linux)."""
+        assert self._server is not None
+        return max(_megabytes(process, "status", "VmHWM") for process in _family(self._server.pid))
 
     def _answers(self) -> bool:
         try:
@@ -166,7 +176,6 @@ class StoreServer:
         self._run(program, "-D", str(self._data), *words, **self._account)
 
     def _run(self, program: str, *words: str, **account: object) -> None:
-        assert self.programs is not None
         done = subprocess.run(
             [self.programs / program, *words],
             env={**os.environ, "PGPASSWORD": self._password},
@@ -264,20 +273,25 @@ def _stored_files(listed: Any, identity: str, path: str | None = None) -> Iterat
             yield file.path, file.file_size
 
 
-def _memory(pid: int) -> float:
-    """Return the memory, MB, of a process and its descendants, with their shares of common memory."""
-    kilobytes, parents = dict[int, int](), dict[int, int]()
+def _family(pid: int) -> list[int]:
+    """Return the numbers of a process and of its descendants."""
+    parents = dict[int, int]()
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):  # the process has ended
-            number = int(process.name)
-            parents[number] = int((process / "stat").read_text().rpartition(")")[2].split()[1])
-            lines = (process / "smaps_rollup").read_text().splitlines()
-            kilobytes[number] = sum(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
+            parents[int(process.name)] = int((process / "stat").read_text().rpartition(")")[2].split()[1])
 
     def belongs(number: int) -> bool:
         return number == pid or (number in parents and belongs(parents[number]))
 
-    return sum(size for number, size in kilobytes.items() if belongs(number)) * 1024 / 1e6
+    return [number for number in parents if belongs(number)]
+
+
+def _megabytes(pid: int, file: str, name: str) -> float:
+    """Return the number of megabytes with a name in a file of a process; 0 if the process has ended."""
+    with suppress(OSError):
+        lines = Path(f"/proc/{pid}/{file}").read_text().splitlines()
+        return next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:")) * 1024 / 1e6
+    return 0.0
 
 
 def _programs() -> Path | None:
