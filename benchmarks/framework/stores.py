@@ -306,6 +306,16 @@ SECTIONS = {
 }
 
 
+HEAD = [
+    "# An MLflow server on PostgreSQL",
+    "",
+    "This page says whether all numbers and files of runs arrive at an MLflow server with a PostgreSQL database "
+    "and passwords if the server is killed while they run, and what such a server costs. Server, database and runs "
+    "share one machine. [docs/stores.md](../../docs/stores.md) says how to start the server. Command: "
+    "`python -m benchmarks.framework.stores`.",
+]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -323,14 +333,7 @@ def main() -> None:
     if part:
         replace_section(Path(__file__).with_suffix(".md"), SECTIONS[part][0], texts[part])
         return
-    text = [
-        "# An MLflow server on PostgreSQL",
-        "",
-        "This page says whether all numbers and files of runs arrive at an MLflow server with a PostgreSQL database "
-        "and passwords if the server is killed while they run, and what such a server costs. Server, database and runs "
-        "share one machine. [docs/stores.md](../../docs/stores.md) says how to start the server. Command: "
-        "`python -m benchmarks.framework.stores`.",
-    ]
+    text = [*HEAD]
     for name, (heading, _) in SECTIONS.items():
         text += ["", heading, "", texts[name]]
     write_page(__file__, text)
