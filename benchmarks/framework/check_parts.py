@@ -161,7 +161,7 @@ def write(
         alarms: Description of each false alarm.
         rows: Number of rows of the plugins of this project.
     """
-    seeds = max(map(len, seconds.values()), default=0)
+    seeds, external = max(map(len, seconds.values()), default=0), len(external_plugins(group))
     caught, count = sum(map(bool, failed_properties.values())), len(failed_properties)
     lines = [
         f"| {name} | {', '.join(properties) or '**missed**'} |"
@@ -193,8 +193,8 @@ The column `fault` names the change, and `failed properties` lists every propert
 ## False alarms
 
 `mode=check` gave {len(alarms)} false alarms, which are failed tests of correct plugins. It tested {rows}
-constructions of the plugins of this project and {len(external_plugins(group))} correct plugins that are not part of
-it, with {seeds} random seeds each.
+constructions of the plugins of this project and {external} correct {"plugin" if external == 1 else "plugins"} that
+{"is" if external == 1 else "are"} not part of it, with {seeds} random seeds each.
 
 {chr(10).join(f"- {alarm}" for alarm in alarms)}
 
