@@ -9,9 +9,11 @@ import torch
 from pydantic import Field
 
 from framework.configuration.paths import FilePath, Words
+from framework.datasets.class_folders import describe_layouts, list_files
+from framework.datasets.shares import assign_folds, check_shares, choose_splits, hold_out
 from framework.errors import DataError
 from framework.geometry.mesh_files import NORMALS, XYZ
-from framework.geometry.meshes import stream
+from framework.geometry.meshes import READERS, stream
 from framework.storage.generated import read_mark
 from plugins.data.labelled_clouds import folders
 from plugins.data.labelled_clouds.archive import read_archive
@@ -20,12 +22,10 @@ from plugins.data.labelled_clouds.labelled_clouds import (
     LabelledClouds,
     Unreadable,
     describe_unread,
-    hold_out,
     load_listed,
 )
 from plugins.data.labelled_clouds.reading import Packed, Reading, round_to_float32, subsample
 from plugins.data.labelled_clouds.shapes.generator import VERSION, Models, generate_models
-from plugins.data.labelled_clouds.shares import assign_folds
 
 FOLDS = 5
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
@@ -164,17 +164,15 @@ class PointCloudFolder(LabelledClouds):
 
     def load_clouds(self) -> CloudSet:
         if self.root is None:
-            raise DataError(f"data.root is not set. {folders.REMEDY}")
-        if sum(self.shares) >= 1:
-            raise DataError(
-                f"data.validation + data.test = {sum(self.shares):g}, but the sum must be less than 1 to leave files "
-                "for training. Reduce one of them."
-            )
+            raise DataError(f"data.root is not set. {describe_layouts(READERS)}")
+        check_shares(*self.shares)
         root = Path(self.root).expanduser()
         self.title = root.resolve().name
-        listed = folders.list_user(root)
+        listed = list_files(root, READERS)
         readable, packed = load_listed(listed, root, self.reading, "point_cloud_folder", self.unreadable)
-        splits = self._choose_splits(readable)
+        splits = choose_splits(
+            readable.splits, readable.labels, *self.shares, stream(self.reading.seed, "splits")
+        )
         missing = set(range(len(readable.classes))) - set(readable.labels[splits == "train"].tolist())
         if missing and "train" in splits:
             raise DataError(
@@ -199,18 +197,6 @@ class PointCloudFolder(LabelledClouds):
             validated_on="validation" if self.shares[0] or "validation" in splits else "train",
             remarks=describe_unread(readable, self.reading),
         )
-
-    def _choose_splits(self, listed: folders.FileList) -> np.ndarray:
-        """Return the split of every file: that of its folder or, without such folders, one chosen by the seed."""
-        splits = np.where(listed.splits == "", "train", listed.splits)
-        random = stream(self.reading.seed, "splits")
-        validation, test = self.shares
-        if "" in listed.splits:
-            hold_out(splits, listed.labels, test, random, "test")
-            validation /= 1 - test  # as a share of the files that are not for the test
-        if "validation" not in listed.splits and validation:
-            hold_out(splits, listed.labels, validation, random)
-        return splits
 
 
 class Dales(LabelledClouds):

@@ -15,15 +15,14 @@ from torch.utils.data import Dataset
 
 from framework.data import Batch, Data, Splits
 from framework.datasets import cloud_picture, images
+from framework.datasets.class_folders import FileList
 from framework.errors import DataError, shorten
 from framework.geometry import meshes
 from framework.geometry.meshes import READERS
 from framework.storage.names import as_bytes, spell_name
 from framework.target import Target
-from plugins.data.labelled_clouds.folders import FileList
 from plugins.data.labelled_clouds.reading import Clouds, Packed, Reading, load_files, load_unlabelled
 from plugins.data.labelled_clouds.rotated import Rotated
-from plugins.data.labelled_clouds.shares import choose_held_out
 
 Unreadable = Literal["error", "skip"]
 
@@ -154,18 +153,6 @@ def describe_unread(listed: FileList, reading: Reading) -> tuple[str, ...]:
         if len(mesh.faces):
             remarks.append(f"points are drawn from the faces of {listed.files[0].name}")
     return tuple(remarks)
-
-
-def hold_out(
-    splits: NDArray,
-    labels: Int[np.ndarray, "clouds"],
-    share: float,
-    random: np.random.Generator,
-    name: str = "validation",
-) -> None:
-    """Move a share of the training clouds, equal in every class, to the split `name`; `splits` is changed in place."""
-    training = np.flatnonzero(splits == "train")
-    splits[training[choose_held_out(labels[training], share, random)]] = name
 
 
 def split_clouds(cloud_set: CloudSet) -> dict[str, Clouds]:

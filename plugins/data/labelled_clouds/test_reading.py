@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from framework.configuration.schema import resolve
+from framework.datasets.shares import assign_folds, choose_held_out
 from framework.errors import ConfigError, DataError
 from framework.geometry import meshes
 from framework.geometry.mesh_files import NORMALS
@@ -22,7 +23,6 @@ from plugins.data.labelled_clouds.reading import (
     load_unlabelled,
     read_cloud,
 )
-from plugins.data.labelled_clouds.shares import assign_folds, choose_held_out
 
 SQUARE = b"OFF\n4 1 0\n0 0 2\n1 0 2\n1 1 2\n0 1 2\n4 0 1 2 3\n"
 

@@ -1,0 +1,137 @@
+"""Layouts of a user's folder of labelled files: by class, by split and class, or by class and split."""
+
+from collections.abc import Collection, Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+from numpy.typing import NDArray
+
+from framework.errors import DataError
+
+SPLITS = ("train", "validation", "test")
+"""Names of the folders of splits."""
+
+
+def describe_layouts(suffixes: Iterable[str]) -> str:
+    """Return advice that names the layouts that `list_files` reads, for files with these suffixes."""
+    return (
+        "Set data.root to a folder with the layout <root>/<class>/<file>, "
+        "<root>/{train,validation,test}/<class>/<file> or <root>/<class>/{train,test}/<file>, where the files are "
+        f"{', '.join(suffixes)}."
+    )
+
+
+class FileList(NamedTuple):
+    """Files in a folder, with their classes and splits.
+
+    Attributes:
+        classes: Names of the classes in alphabetical order.
+        files: The files.
+        labels: Class of each file, an index into `classes`.
+        splits: Split of each file; "" if it is to be chosen at random.
+        ignored: Number of files of other kinds.
+    """
+
+    classes: tuple[str, ...]
+    files: list[Path]
+    labels: Int[np.ndarray, "files"]
+    splits: NDArray
+    ignored: int
+
+    def select(self, indices: Iterable[int]) -> "FileList":
+        """Return a list of only the files with these indices."""
+        chosen = list(indices)
+        files = [self.files[index] for index in chosen]
+        return self._replace(files=files, labels=self.labels[chosen], splits=self.splits[chosen])
+
+
+def list_files(root: Path, suffixes: Collection[str]) -> FileList:
+    """Return the files of a user's folder that have one of the suffixes.
+
+    Raises:
+        DataError: The folder is missing or has none of the layouts, a class has no files, or there are fewer than two
+            classes.
+    """
+    remedy = describe_layouts(suffixes)
+    folders = subfolders(root, remedy)
+    names = {path.name for path in folders}
+    if {"train", "test"} & names:
+        unexpected, missing = sorted(names - set(SPLITS)), sorted({"train", "test"} - names)
+        if unexpected or missing:
+            fault = (
+                f"holds a folder {unexpected[0]} beside folders of splits"
+                if unexpected
+                else f"holds no folder {missing[0]}"
+            )
+            raise DataError(
+                f"data.root = {root} {fault}. The folders of splits are {', '.join(SPLITS)}; only validation may be "
+                f"missing. {remedy}"
+            )
+        folders_of_class = [
+            (inner.name, split.name, inner) for split in folders for inner in subfolders(split, remedy)
+        ]
+    else:
+        inside = {path: [inner.name for inner in subfolders(path, remedy)] for path in folders}
+        by_split = [path for path, inner_names in inside.items() if set(inner_names) == {"train", "test"}]
+        for path, inner_names in inside.items():
+            if by_split and path not in by_split:
+                raise DataError(
+                    f"data.root = {root}: The folder {path.name} has no folders train and test, but others have. "
+                    + remedy
+                )
+            if inner_names and not by_split:
+                raise DataError(
+                    f"data.root = {root}: The folder {path.name} holds further folders ({', '.join(inner_names)}). "
+                    + remedy
+                )
+        splits = ("test", "train") if by_split else ("",)
+        folders_of_class = [(path.name, split, path / split) for path in folders for split in splits]
+    classes = sorted({name for name, _, _ in folders_of_class})
+    if len(classes) < 2:
+        raise DataError(
+            f"data.root = {root} holds {len(classes)} classes ({', '.join(classes) or 'no folder'}), but at least two "
+            f"are required. {remedy}"
+        )
+    folders_of_class.sort(key=lambda entry: (entry[1], entry[0]))
+    return collect(classes, folders_of_class, suffixes, "file that can be read", remedy)
+
+
+def collect(
+    classes: Sequence[str],
+    folders_of_class: Iterable[tuple[str, str, Path]],
+    suffixes: Iterable[str],
+    kind: str,
+    remedy: str,
+) -> FileList:
+    """Return the files of folders with their class and split; hidden files and files of other suffixes are ignored.
+
+    Args:
+        classes: Names of the classes.
+        folders_of_class: The folders, each with the name of its class and of its split: (class, split, folder).
+        suffixes: Suffixes of the files to return, in small letters.
+        kind: Name of such a file in messages.
+        remedy: Advice in messages.
+    """
+    files, labels, splits, ignored = [], [], [], 0
+    for name, split, folder in folders_of_class:
+        visible = (path for path in folder.iterdir() if not path.name.startswith("."))
+        # a folder with such a suffix is listed too; the message about reading it says that it is no file
+        entries = sorted(path for path in visible if path.is_file() or path.suffix.lower() in suffixes)
+        matching = [path for path in entries if path.suffix.lower() in suffixes]
+        ignored += len(entries) - len(matching)
+        if not matching:
+            content = ", ".join(path.name for path in entries[:3]) or "nothing"
+            raise DataError(f"{folder} holds no {kind}, but {content}. {remedy}")
+        files += matching
+        labels += [classes.index(name)] * len(matching)
+        splits += [split] * len(matching)
+    return FileList(tuple(classes), files, np.array(labels), np.array(splits, "<U10"), ignored)
+
+
+def subfolders(root: Path, remedy: str) -> list[Path]:
+    """Return the folders in `root`, sorted, without those whose names begin with a dot or an underscore."""
+    if not root.is_dir():
+        raise DataError(f"data.root = {root} does not exist or is no folder. {remedy}")
+    return sorted(path for path in root.iterdir() if path.is_dir() and path.name[0] not in "._")
