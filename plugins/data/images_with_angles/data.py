@@ -14,11 +14,12 @@ from framework.configuration.paths import FilePath, Words
 from framework.data import Batch, Data, Splits
 from framework.datasets import given_images, images
 from framework.datasets.csv_columns import Writing
+from framework.datasets.file_columns import SPLITS
 from framework.datasets.images import Crop
 from framework.errors import DataError, did_you_mean
 from framework.storage.names import spell_name
 from framework.target import Target
-from plugins.data.images_with_angles.table import SPLITS, Table, read_table
+from plugins.data.images_with_angles.table import Table, read_table
 
 
 class ImagesWithAngles(Data):

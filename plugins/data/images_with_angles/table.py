@@ -1,11 +1,9 @@
 """Reading of the table of the images, which has a line for each image with its angles and optionally its split."""
 
-import hashlib
 import math
-import posixpath
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple, cast
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -17,15 +15,10 @@ from framework.datasets.csv_columns import (
     describe_choice,
     numbers,
     numeric_columns,
-    read_columns,
     require,
 )
-from framework.errors import DataError, did_you_mean, quote, shorten
-
-Split = Literal["train", "validation", "test"]
-SPLITS: tuple[Split, ...] = ("train", "validation", "test")
-SHARES = {"train": 0.70, "validation": 0.15, "test": 0.15}
-FILE, SPLIT = "file", "split"
+from framework.datasets.file_columns import FILE, SPLIT, Split, list_files, read_file_columns, split_of
+from framework.errors import DataError, quote
 
 
 class Row(NamedTuple):
@@ -64,62 +57,24 @@ def read_table(
     Raises:
         DataError: The file is missing, or a header, cell or file name is wrong; the message names the line.
     """
-    table = _read(file, writing or Writing())
+    table = read_file_columns(
+        file,
+        writing,
+        f"expected a table with a column `{FILE}` and a column for each angle. Write such a table, or set data.csv to "
+        "the path of another table.",
+    )
     chosen = _angle_columns(table, columns)
     values = {column: numbers(table, column, missing="").tolist() for column in chosen.names}
     for column in chosen.names:
         _refuse_other_unit(file, column, np.array(values[column]), angles_in)
     to_radians = math.radians if angles_in != "radians" else float
-    first_line: dict[str, int] = {}
-    rows = []
-    for index, (number, path) in enumerate(zip(table.lines, table.cells[FILE], strict=True)):
-        # `./a.png` and `a.png` are the same image, which must be in one split only
-        name = posixpath.normpath(path) if path else ""
-        if not name:
-            raise DataError(
-                f"{file} line {number}: The column `{FILE}` is empty. Write the name of an image there."
-            )
-        if name in first_line:
-            raise DataError(
-                f"{file} line {number}: {quote(path)} is already listed in line {first_line[name]}. Remove one of the "
-                "two lines."
-            )
-        first_line[name] = number
-        split = _split(file, number, table.cells[SPLIT][index]) if SPLIT in table.cells else split_of(name)
-        rows.append(Row(name, split, tuple(to_radians(values[column][index]) for column in chosen.names)))
-    return Table(chosen.names, rows, describe_choice(chosen))
-
-
-def split_of(name: str) -> Split:
-    """Return train (70 %), validation (15 %) or test (15 %), chosen by a hash of the name.
-
-    Adding images therefore never moves other images to another split.
-    """
-    share = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8]) / 2**64
-    for split in SPLITS:
-        share -= SHARES[split]
-        if share < 0:
-            return split
-    return SPLITS[-1]
-
-
-def _read(file: Path, writing: Writing) -> Columns:
-    """Return the cells of a table, after checking that it has a column of file names.
-
-    Raises:
-        DataError: The table cannot be read, or has no such column.
-    """
-    missing = (
-        f"expected a table with a column `{FILE}` and a column for each angle. Write such a table, or set data.csv to "
-        "the path of another table."
-    )
-    table = read_columns(file, writing, missing)
-    if FILE not in table.cells:
-        raise DataError(
-            f"{file} has no column `{FILE}`.{did_you_mean(FILE, table.cells)} Its first line names "
-            f"{shorten(', '.join(table.cells))}. Name the column of the images `{FILE}`."
+    rows = [
+        Row(
+            name, split or split_of(name), tuple(to_radians(values[column][index]) for column in chosen.names)
         )
-    return table
+        for index, (name, split) in enumerate(list_files(table))
+    ]
+    return Table(chosen.names, rows, describe_choice(chosen))
 
 
 def _angle_columns(table: Columns, requested: Sequence[str] | None) -> ColumnChoice:
@@ -159,13 +114,3 @@ def _refuse_other_unit(
         raise DataError(
             f"{file}, column {quote(column)}: {wrong}. Leave data.angles_in out, or wrap the angles to one turn."
         )
-
-
-def _split(file: Path, number: int, word: str) -> Split:
-    """Return the split that a cell in line `number` names."""
-    if word not in SPLITS:
-        raise DataError(
-            f"{file} line {number}, column `{SPLIT}`: {quote(word)} is no split. Write one of {', '.join(SPLITS)}."
-            f"{did_you_mean(word, SPLITS)}"
-        )
-    return cast(Split, word)

@@ -15,10 +15,10 @@ from PIL import Image
 
 from framework.configuration import schema
 from framework.datasets.fields import Fields
+from framework.datasets.file_columns import SPLITS, split_of
 from framework.errors import ConfigError, DataError
 from framework.testing.data_samples import fields_of, prepared
 from plugins.data.images_with_angles.data import ImagesWithAngles
-from plugins.data.images_with_angles.table import SPLITS, split_of
 
 
 def write_folder(root: Path, table: str | None = None, images: int = 40) -> Path:

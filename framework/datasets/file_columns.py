@@ -1,0 +1,77 @@
+"""The columns `file` and `split` of a CSV table that lists images."""
+
+import hashlib
+import posixpath
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal, cast
+
+from framework.datasets.csv_columns import Columns, Writing, read_columns
+from framework.errors import DataError, did_you_mean, quote, shorten
+
+Split = Literal["train", "validation", "test"]
+SPLITS: tuple[Split, ...] = ("train", "validation", "test")
+SHARES = {"train": 0.70, "validation": 0.15, "test": 0.15}
+FILE, SPLIT = "file", "split"
+
+
+def read_file_columns(file: Path, writing: Writing | None, missing: str) -> Columns:
+    """Return the cells of a table, after checking that it has a column of file names.
+
+    Args:
+        file: Path of the table.
+        writing: Notation of the table; None: decimal points and no units.
+        missing: End of the message about a table that does not exist.
+
+    Raises:
+        DataError: The table cannot be read, or has no such column.
+    """
+    table = read_columns(file, writing, missing)
+    if FILE not in table.cells:
+        raise DataError(
+            f"{file} has no column `{FILE}`.{did_you_mean(FILE, table.cells)} Its first line names "
+            f"{shorten(', '.join(table.cells))}. Name the column of the images `{FILE}`."
+        )
+    return table
+
+
+def list_files(table: Columns) -> Iterator[tuple[str, Split | None]]:
+    """Yield the file and the split of each row; the split is None if the table has no column of splits.
+
+    Raises:
+        DataError: A name of a file is missing or occurs twice, or a split is unknown; the message names the line.
+    """
+    first_line: dict[str, int] = {}
+    for index, (number, path) in enumerate(zip(table.lines, table.cells[FILE], strict=True)):
+        # `./a.png` and `a.png` are the same image, which must be in one split only
+        name = posixpath.normpath(path) if path else ""
+        if not name:
+            raise DataError(
+                f"{table.file} line {number}: The column `{FILE}` is empty. Write the name of an image there."
+            )
+        if name in first_line:
+            raise DataError(
+                f"{table.file} line {number}: {quote(path)} is already listed in line {first_line[name]}. Remove one "
+                "of the two lines."
+            )
+        first_line[name] = number
+        word = table.cells[SPLIT][index] if SPLIT in table.cells else None
+        if word is not None and word not in SPLITS:
+            raise DataError(
+                f"{table.file} line {number}, column `{SPLIT}`: {quote(word)} is no split. Write one of "
+                f"{', '.join(SPLITS)}.{did_you_mean(word, SPLITS)}"
+            )
+        yield name, cast(Split | None, word)
+
+
+def split_of(name: str) -> Split:
+    """Return train (70 %), validation (15 %) or test (15 %), chosen by a hash of the name.
+
+    Adding images therefore never moves other images to another split.
+    """
+    share = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8]) / 2**64
+    for split in SPLITS:
+        share -= SHARES[split]
+        if share < 0:
+            return split
+    return SPLITS[-1]
