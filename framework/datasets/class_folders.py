@@ -47,12 +47,12 @@ class FileList(NamedTuple):
         return self._replace(files=files, labels=self.labels[chosen], splits=self.splits[chosen])
 
 
-def list_files(root: Path, suffixes: Collection[str]) -> FileList:
+def list_files(root: Path, suffixes: Collection[str], fewest: int = 2) -> FileList:
     """Return the files of a user's folder that have one of the suffixes.
 
     Raises:
-        DataError: The folder is missing or has none of the layouts, a class has no files, or there are fewer than two
-            classes.
+        DataError: The folder is missing or has none of the layouts, a class has no files, or there are fewer than
+            `fewest` classes.
     """
     remedy = describe_layouts(suffixes)
     folders = subfolders(root, remedy)
@@ -89,10 +89,10 @@ def list_files(root: Path, suffixes: Collection[str]) -> FileList:
         splits = ("test", "train") if by_split else ("",)
         folders_of_class = [(path.name, split, path / split) for path in folders for split in splits]
     classes = sorted({name for name, _, _ in folders_of_class})
-    if len(classes) < 2:
+    if len(classes) < fewest:
         raise DataError(
-            f"data.root = {root} holds {len(classes)} classes ({', '.join(classes) or 'no folder'}), but at least two "
-            f"are required. {remedy}"
+            f"data.root = {root} holds {len(classes)} classes ({', '.join(classes) or 'no folder'}), but at least "
+            f"{fewest} are required. {remedy}"
         )
     folders_of_class.sort(key=lambda entry: (entry[1], entry[0]))
     return collect(classes, folders_of_class, suffixes, "file that can be read", remedy)

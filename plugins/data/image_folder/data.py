@@ -1,0 +1,231 @@
+"""Data sets of a user's labelled images; framework.data describes the contract."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, Shaped
+from pydantic import Field
+from torch import Tensor
+from torch.nn import functional
+from torch.utils.data import Dataset
+
+from framework.configuration.paths import FilePath
+from framework.data import Batch, Data, Splits
+from framework.datasets import given_images, images
+from framework.datasets.fields import FetchedInBatches, fetch
+from framework.target import Target
+from plugins.data.image_folder.corruption import Corrupted, Corruption
+from plugins.data.image_folder.labelled import LabelledImages, Loaded, find_folder
+
+Jitter = Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)]
+
+
+class LabelledData(Data):
+    """Base of the data sets of this folder.
+
+    Args:
+        root: Folder of the images. It holds folders that are named by class, perhaps within folders train, validation
+            and test; or idx files such as train-images-idx3-ubyte.gz, with the files of their labels.
+        labelled: Settings of the images and their labels.
+        jitter: Largest share by which training images are shifted, scaled and made brighter or darker.
+    """
+
+    bibtex = "image_folder"
+    suffixes = images.SUFFIXES
+    synthetic = False
+    fewest: ClassVar[int] = 2
+    """Smallest number of classes."""
+
+    def __init__(self, root: str | None, labelled: LabelledImages, jitter: float) -> None:
+        self.root = root
+        self.labelled = labelled
+        self.jitter = jitter
+        self.input_shape = labelled.input_shape
+
+    _splits: Splits
+
+    def _keep(self, loaded: Loaded) -> None:
+        """Keep what is known of the images."""
+        self.title = find_folder(self.root).resolve().name
+        self.skipped, self.remarks = loaded.skipped, loaded.remarks
+        self._digest = loaded.digest
+        self._sizes = {split: str(len(table)) for split, table in loaded.splits.items()}
+
+    def check_files(self) -> None:
+        self.labelled.list_images(find_folder(self.root), self.fewest)
+
+    def splits(self) -> Splits:
+        return self._splits
+
+    def read(self, files: Sequence[Path]) -> Dataset[Batch]:
+        return images.load_unlabelled([self.labelled.crop(Path(file)) for file in files])
+
+    def inputs(self, user_data: Any) -> Tensor:
+        return given_images.to_inputs(self, user_data)
+
+    def fingerprint(self) -> Mapping[str, str]:
+        shape = "×".join(map(str, self.input_shape))
+        return {"root": str(self.root), "version": "1", "shape": shape, **self._sizes, "sha256": self._digest}
+
+    def preview(self, inputs: Tensor) -> np.ndarray:
+        return images.to_rgb8(inputs)
+
+
+class ImageFolder(LabelledData):
+    """A user's own images with classes: folders named by class, a table of labels, or idx files as those of MNIST.
+
+    Args:
+        root: Folder of the images. It holds folders that are named by class, perhaps within folders train, validation
+            and test; or idx files such as train-images-idx3-ubyte.gz, with the files of their labels.
+        labelled: Settings of the images and their labels.
+        mirror: Whether half of the training images are mirrored left to right.
+        jitter: Largest share by which training images are shifted, scaled and made brighter or darker.
+        corruption: Corruption of the test images: Gaussian noise, a Gaussian blur, less contrast, or JPEG compression;
+            None for none.
+        strength: Strength of the corruption, as in ImageNet-C.
+    """
+
+    bibtex = "image_folder, hendrycks2019benchmarking"
+
+    def __init__(
+        self,
+        *,
+        root: FilePath | None = None,
+        labelled: LabelledImages,
+        mirror: bool = False,
+        jitter: Jitter = 0.08,
+        corruption: Corruption | None = None,
+        strength: Annotated[int, Field(ge=1, le=5)] = 3,
+    ) -> None:
+        super().__init__(root, labelled, jitter)
+        self.mirror = mirror
+        self.corruption: Corruption | None = corruption
+        self.strength = strength
+
+    def prepare(self) -> None:
+        loaded = self.labelled.load(
+            find_folder(self.root),
+            lambda labels, split: {"target": labels, "group": torch.zeros_like(labels)},
+            self.fewest,
+        )
+        self._keep(loaded)
+        self.target = Target("class", loaded.classes)
+        self.groups = (self.title,)
+        self._splits = Splits(**loaded.splits)
+        if self.corruption is not None:
+            self._splits = self._splits._replace(
+                test=Corrupted(self._splits.test, self.corruption, self.strength)
+            )
+            self.remarks += (f"test images are corrupted: {self.corruption}, strength {self.strength} of 5",)
+
+    def augment(self, batch: Batch) -> Batch:
+        if not self.jitter and not self.mirror:
+            return batch
+        mirrored = (torch.rand(len(batch["input"])) < 0.5) & self.mirror
+        return {**batch, "input": images.augment(batch["input"], mirrored, self.jitter)}
+
+    def fingerprint(self) -> Mapping[str, str]:
+        corruption = "none" if self.corruption is None else f"{self.corruption} {self.strength}"
+        return {**super().fingerprint(), "corruption": corruption}
+
+
+class TurnedImages(LabelledData):
+    """A user's own images, each turned by a random angle, which is the target; classes are groups of the results.
+
+    An image is turned counter-clockwise about its centre, and only the largest disc inside the square is kept, since
+    corners would tell the angle. An image of validation and test is always turned by the same angle. A training image
+    is turned by a new angle in every epoch.
+
+    Args:
+        root: Folder of the images. It holds folders that are named by class, perhaps within folders train, validation
+            and test; or idx files such as train-images-idx3-ubyte.gz, with the files of their labels.
+        labelled: Settings of the images and their labels.
+        jitter: Largest share by which training images are shifted, scaled and made brighter or darker.
+    """
+
+    fewest = 1
+
+    def __init__(
+        self, *, root: FilePath | None = None, labelled: LabelledImages, jitter: Jitter = 0.0
+    ) -> None:
+        super().__init__(root, labelled, jitter)
+
+    def prepare(self) -> None:
+        loaded = self.labelled.load(find_folder(self.root), self._choose_angles, self.fewest)
+        self._keep(loaded)
+        self.target = Target("angle", ("turn",))
+        self.groups = loaded.classes
+        self._upright = loaded.splits["train"]
+        self._splits = Splits(**{split: Turned(table) for split, table in loaded.splits.items()})
+
+    def _choose_angles(self, labels: Int[Tensor, "samples"], split: str) -> dict[str, Tensor]:
+        """Return an angle for each sample, uniform in [-π, π), and its class as its group."""
+        seed = [self.labelled.data_seed, Splits._fields.index(split)]
+        turns = np.random.default_rng(seed).uniform(-math.pi, math.pi, (len(labels), 1))
+        return {"target": torch.from_numpy(turns.astype(np.float32)), "group": labels}
+
+    def read(self, files: Sequence[Path]) -> Dataset[Batch]:
+        return Turned(super().read(files))
+
+    def inputs(self, user_data: Any) -> Tensor:
+        return keep_disc(super().inputs(user_data))
+
+    def augment(self, batch: Batch) -> Batch:
+        angles = (2 * torch.rand(len(batch["target"]), dtype=torch.float32) - 1) * math.pi
+        upright = fetch(self._upright, batch["index"].tolist())["input"].to(batch["input"].device)
+        if self.jitter:
+            upright = images.augment(upright, torch.zeros(len(upright), dtype=torch.bool), self.jitter)
+        angles = angles.to(batch["target"])
+        return {**batch, "input": turn(upright, angles), "target": angles[:, None]}
+
+
+class Turned(FetchedInBatches):
+    """Data set whose images are turned by their targets when they are fetched; without targets they are upright.
+
+    Args:
+        upright: Data set of upright images.
+    """
+
+    def __init__(self, upright: Dataset[Batch]) -> None:
+        self.upright = upright
+
+    def __len__(self) -> int:
+        return len(self.upright)  # type: ignore[arg-type]
+
+    def __getitems__(self, indices: Sequence[int]) -> Batch:
+        batch = fetch(self.upright, indices)
+        if "target" not in batch:
+            return {**batch, "input": keep_disc(batch["input"])}
+        return {**batch, "input": turn(batch["input"], batch["target"][:, 0])}
+
+
+def turn(
+    pixels: Shaped[Tensor, "batch channels side side"], angles: Float[Tensor, "batch"]
+) -> Shaped[Tensor, "batch channels side side"]:
+    """Turn images counter-clockwise about their centres, with linear interpolation, and keep only the disc inside.
+
+    Args:
+        pixels: Square images; integers are rounded.
+        angles: Angle of each image, radians.
+    """
+    cosine, sine, zero = angles.cos(), angles.sin(), torch.zeros_like(angles)
+    # Rows count downwards: a pixel of the result is read from the image at its position turned clockwise.
+    rows = [torch.stack([cosine, -sine, zero], -1), torch.stack([sine, cosine, zero], -1)]
+    grid = functional.affine_grid(torch.stack(rows, 1), list(pixels.shape), align_corners=False)
+    values = pixels if pixels.is_floating_point() else pixels.float()
+    turned = functional.grid_sample(values, grid.to(values), padding_mode="border", align_corners=False)
+    return keep_disc(turned if pixels.is_floating_point() else turned.round().to(pixels.dtype))
+
+
+def keep_disc(
+    pixels: Shaped[Tensor, "batch channels side side"],
+) -> Shaped[Tensor, "batch channels side side"]:
+    """Set pixels whose centres lie outside the largest disc in the square to 0."""
+    side = pixels.shape[-1]
+    offset = torch.arange(side, device=pixels.device) - (side - 1) / 2
+    inside = offset[:, None].square() + offset.square() <= (side / 2) ** 2
+    return pixels * inside
