@@ -95,8 +95,9 @@ class StudentTHead(DensityHead):
         """
         location, scale, freedom = self._parts(raw)
         value = self.unit.standardise(target).to(location)
-        if self.calibrated:  # the normal density, in fewer passes
-            losses = ((value - location) / scale).square() / 2 + scale.log() + math.log(2 * math.pi) / 2
+        if self.calibrated:  # the density with ν = NORMAL, in fewer passes
+            bend = torch.log1p(((value - location) / scale).square() / NORMAL)
+            losses = (NORMAL + 1) / 2 * bend + scale.log() + math.log(2 * math.pi) / 2
         else:
             losses = -StudentT(location, scale, freedom).each_log_prob(value)
         if self.balance:
