@@ -176,6 +176,7 @@ def test_nothing_instantiates_from_a_config_or_loads_pickles() -> None:
 
 NOT_IN_THE_THESIS = {
     "data/coil20",
+    "data/image_folder",
     "data/images_with_angles",
     "data/pose_from_image",
     "data/tabular",

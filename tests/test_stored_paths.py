@@ -155,6 +155,8 @@ def test_what_is_said_to_be_words_is_no_path() -> None:
         "tabular.columns",
         "tabular.units",
         "tabular.missing_words",
+        "image_folder.classes",
+        "turned_images.classes",
         "images_with_angles.units",
         "table_tennis.units",
         "images_with_angles.angle_columns",

@@ -32,6 +32,7 @@ from plugins.data.cest.volumes import read_volume
 from plugins.data.coil20.views import read_views
 from plugins.data.head_pose import caviar_labels, idiap_labels, towncentre_labels
 from plugins.data.human_scans import skins
+from plugins.data.image_folder.idx import read_idx
 from plugins.data.images_with_angles.table import read_table
 from plugins.data.labelled_clouds.archive import read_archive
 from plugins.data.pascal3d import layout
@@ -270,6 +271,11 @@ def tables_and_images() -> Iterator[Reader]:
         [angles],
         lambda file: read_table(file, None, None),
         crafted=crafted.CSV,
+    )
+    digits = bytes([0, 0, 8, 3, 0, 0, 0, 5, 0, 0, 0, 4, 0, 0, 0, 4]) + bytes(range(80))
+    yield Reader("idx", "one", [digits], lambda file: read_idx(file, 3))
+    yield Reader(
+        "idx, packed", "one.gz", [gzip.compress(digits, 1)], lambda file: read_idx(file, 3), [in_gzip]
     )
     pngs = [image("PNG"), image("PNG", "P"), image("PNG", "RGBA"), image("PNG", "I;16")]
     jpegs = [image("JPEG"), image("JPEG", progressive=True), image("JPEG", "L"), image("JPEG", "CMYK")]

@@ -87,7 +87,7 @@ class LabelledImages:
         unreadable: Treatment of files that cannot be read. "error" refuses them, "skip" leaves them out.
     """
 
-    csv: Words | None = None
+    csv: str | None = None
     classes: list[Words] | None = None
     validation: Share = 0.15
     test: Share = 0.15
