@@ -78,12 +78,14 @@ NOT_RUN = {
     "faust",
     "pose_from_image",
     "human_scans",
+    "image_folder",
     "pascal3d",
     "table_tennis",
     "tabular",
+    "turned_images",
     "uci",
 }
-"""The files of four are the user's; four first make a body, which takes minutes; test_ranks.py runs pascal3d; of
+"""The files of six are the user's; four first make a body, which takes minutes; test_ranks.py runs pascal3d; of
 flights no preset gives the thesis's setting."""
 
 
@@ -103,6 +105,7 @@ def test_a_smoke_run_goes_through_every_stage(data: str, framework: Framework) -
 REFUSED = {
     "coil20": "data.root is not set",
     "dales": "data.root is not set",
+    "images": "data.root is not set",
     "tabular": "data.path is not set",
     "uci": "data.root is not set",
     "smplpix/thesis": "objective.perceptual.weights is null",
