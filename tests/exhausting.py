@@ -41,6 +41,7 @@ from framework.model import fitted_models
 from framework.storage import checkpoints
 from framework.target import Target
 from framework.testing.contract import contract
+from tests.fuzz.crafted_files import plain_png
 
 HUGE = (20_000, 30_000_000)
 """Values that replace each whole number of a config."""
@@ -339,7 +340,7 @@ def bombs() -> dict[str, tuple[Callable[[], bytes], Callable[[Path], object]]]:
     found: dict[str, tuple[Callable[[], bytes], Callable[[Path], object]]] = {
         "a PNG with alpha.png": (lambda: image("RGBA", (side, side), "PNG"), shown),
         "a PNG of 16 bits.png": (lambda: image("I;16", (side, side), "PNG"), shown),
-        "a PNG beyond the bound.png": (lambda: image("1", (60_000, 60_000), "PNG"), shown),
+        "a PNG beyond the bound.png": (lambda: plain_png(60_000, 60_000), shown),
         "a strip.png": (lambda: image("RGBA", (65_536, 700), "PNG"), shown),
         "a progressive JPEG.jpg": (lambda: image("RGB", (side, side), "JPEG", progressive=True), shown),
         "a WebP.webp": (lambda: image("RGBA", (5700, 5700), "WEBP", lossless=True, method=0), shown),

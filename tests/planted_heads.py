@@ -52,6 +52,11 @@ NO_CASES = {"floor": 1e-9}
 """Configuration of a head for which there are no reference values."""
 
 
+def _asked(name: str) -> Any:
+    """Return a property of `Changed` that asks its density."""
+    return property(lambda density: density.ask(name))
+
+
 class Changed(Distribution):
     """A density of which some results are replaced.
 
@@ -88,21 +93,7 @@ class Changed(Distribution):
     def enumerate_support(self, expand: bool = True) -> Tensor:
         return self.ask("enumerate_support", expand)
 
-    @property
-    def mode(self) -> Tensor:
-        return self.ask("mode")
-
-    @property
-    def mean(self) -> Tensor:
-        return self.ask("mean")
-
-    @property
-    def variance(self) -> Tensor:
-        return self.ask("variance")
-
-    @property
-    def support(self) -> Any:
-        return self.ask("support")
+    mode, mean, variance, support = map(_asked, ("mode", "mean", "variance", "support"))
 
 
 @estimate.register

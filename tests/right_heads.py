@@ -157,14 +157,10 @@ class LaplaceHead(_OfReals):
         return Product(Laplace, *self.parameters_of(raw))
 
 
-class Logistic(Distribution):
-    """Independent logistic densities e^-z / (s (1 + e^-z)²), with all results that have a closed form."""
+class _Located(Distribution):
+    """Base of independent densities with a location and a width, symmetric about the location."""
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
-
-    @property
-    def support(self) -> constraints.Constraint:
-        return constraints.real_vector
 
     def __init__(self, place: Tensor, scale: Tensor) -> None:
         self.place, self.width = place, scale
@@ -173,6 +169,29 @@ class Logistic(Distribution):
     @property
     def mode(self) -> Tensor:
         return self.place
+
+
+@marginal.register
+def _(density: _Located, index: int) -> _Located:
+    return type(density)(density.place[..., index : index + 1], density.width[..., index : index + 1])
+
+
+@median.register
+def _(density: _Located, samples: int) -> Tensor:
+    return density.place
+
+
+@pick.register
+def _(density: _Located, index: Tensor) -> _Located:
+    return type(density)(take(density.place, index), take(density.width, index))
+
+
+class Logistic(_Located):
+    """Independent logistic densities e^-z / (s (1 + e^-z)²), with all results that have a closed form."""
+
+    @property
+    def support(self) -> constraints.Constraint:
+        return constraints.real_vector
 
     @property
     def mean(self) -> Tensor:
@@ -232,24 +251,14 @@ class LogisticHead(_OfReals):
         self.factor.copy_(factors[int(torch.stack(found).argmax())])
 
 
-class WrappedNormal(Distribution):
+class WrappedNormal(_Located):
     """Σ_k N(φ + 2πk; μ, σ²) for each angle (Mardia & Jupp 2000, §3.5.7), σ ≤ 2."""
-
-    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
 
     @property
     def support(self) -> constraints.Constraint:
         return circular
 
     turns = 2 * math.pi * torch.arange(-3, 4, dtype=torch.float64)
-
-    def __init__(self, place: Tensor, scale: Tensor) -> None:
-        self.place, self.width = place, scale
-        super().__init__(place.shape[:-1], place.shape[-1:], validate_args=False)
-
-    @property
-    def mode(self) -> Tensor:
-        return self.place
 
     def each(self, value: Tensor) -> Tensor:
         standard = (wrap(value - self.place).unsqueeze(-1) + self.turns.to(value)) / self.width.unsqueeze(-1)
@@ -275,24 +284,6 @@ class WrappedNormal(Distribution):
 
 
 estimate.register(WrappedNormal, exact_estimate)
-
-
-Located = Logistic | WrappedNormal
-
-
-@marginal.register
-def _(density: Located, index: int) -> Located:
-    return type(density)(density.place[..., index : index + 1], density.width[..., index : index + 1])
-
-
-@median.register
-def _(density: Located, samples: int) -> Tensor:
-    return density.place
-
-
-@pick.register
-def _(density: Located, index: Tensor) -> Located:
-    return type(density)(take(density.place, index), take(density.width, index))
 
 
 @arc_probability.register

@@ -29,7 +29,8 @@ ROOT = Path(__file__).parent.parent
 def test_no_reader_crashes_hangs_or_raises_anything_but_a_sentence(count: int, tmp_path: Path) -> None:
     """Whole files, pipes, devices, folders, and crafted and damaged files, a tenth for the arrays of each plugin.
 
-    Nor takes one of them more than 1 GiB, changes an array elsewhere, or has damage answer as if it were whole.
+    Nor takes one of them more than 1 GiB, changes an array elsewhere, or has damage answer as if it were whole. Each
+    module that guards a file is among the readers.
     """
     done = subprocess.run(
         [sys.executable, "-m", "tests.fuzz.fuzz", "--files", str(count), "--check"],
@@ -46,6 +47,7 @@ def test_no_reader_crashes_hangs_or_raises_anything_but_a_sentence(count: int, t
     fuzzed = {line.partition(":")[0] for line in lines}
     storing = {name for group in ("density_head", "encoder", "uncertainty") for name in arrays_of(group)}
     assert storing - fuzzed <= STORE_NOTHING
+    require_every_reader({*done.stdout.rpartition("guards: ")[2].split()})
 
 
 def arrays_of(group: str) -> list[str]:
@@ -57,14 +59,8 @@ STORE_NOTHING = {"arrays of density_head lorentzian", "arrays of encoder incepti
 networks."""
 
 
-@pytest.mark.slow
-def test_every_reader_of_the_project_is_among_them() -> None:
-    """Each module that guards a file reads a whole one where the damaged ones are read; no other module opens files."""
-    done = subprocess.run(
-        [sys.executable, "-c", WHO_READS], cwd=ROOT, capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
-    reached = set(done.stdout.split())
+def require_every_reader(reached: set[str]) -> None:
+    """Require that `reached` holds each module that guards a file, and that no other module opens files."""
     guarding, opening = set[str](), set[str]()
     for file in (path for top in ("framework", "plugins") for path in (ROOT / top).rglob("*.py")):
         name = file.relative_to(ROOT).as_posix()
@@ -111,28 +107,6 @@ OWN_FILES = {
     "plugins/density_head/von_mises/coefficients.py": "the package's table of coefficients",
 }
 """Modules outside `framework.storage` that open files, and the files that they open."""
-WHO_READS = """
-import sys
-from tests.fuzz.damage import scratch
-from tests.fuzz.damaged_readers import readers
-from tests.fuzz.fuzz import whole
-from framework.storage.reading import translate_errors
-
-code, found = translate_errors.__wrapped__.__code__, set()
-
-def called(frame, event, argument):
-    if event == "call" and frame.f_code is code:  # by contextlib, by whoever guards
-        found.add(frame.f_back.f_back.f_code.co_filename)
-
-for reader in readers():
-    reader.samples  # made before
-    with scratch() as folder:
-        sys.setprofile(called)
-        whole(reader, folder)
-        sys.setprofile(None)
-here = __import__("os").getcwd()
-print(*(file[len(here) + 1:] for file in found if file.startswith(here)))
-"""
 
 
 def test_a_strip_is_scaled_before_it_is_padded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

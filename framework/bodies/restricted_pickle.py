@@ -23,23 +23,19 @@ import numpy as np
 from framework.errors import shorten
 
 MULTIARRAY = ("numpy.core.multiarray", "numpy._core.multiarray")
-ALLOWED = {
-    **{(module, name): name for module in MULTIARRAY for name in ("_reconstruct", "scalar")},
-    ("numpy.core.numeric", "_frombuffer"): "_frombuffer",
-    ("numpy._core.numeric", "_frombuffer"): "_frombuffer",
-    ("numpy", "ndarray"): "ndarray",
-    ("numpy", "dtype"): "dtype",
-    ("_codecs", "encode"): "encode",
-    ("copy_reg", "_reconstructor"): "_reconstructor",
-    ("copyreg", "_reconstructor"): "_reconstructor",
-    ("__builtin__", "object"): "object",
-    ("builtins", "object"): "object",
-    ("__builtin__", "bytes"): "bytes",
-    ("builtins", "bytes"): "bytes",
+_NAMES = {
+    **dict.fromkeys(MULTIARRAY, ("_reconstruct", "scalar")),
+    **dict.fromkeys(("numpy.core.numeric", "numpy._core.numeric"), ("_frombuffer",)),
+    "numpy": ("ndarray", "dtype"),
+    "_codecs": ("encode",),
+    **dict.fromkeys(("copy_reg", "copyreg"), ("_reconstructor",)),
+    **dict.fromkeys(("__builtin__", "builtins"), ("object", "bytes")),
     # the autodiff library whose arrays hold the first published body models
-    ("chumpy.ch", "Ch"): "Ch",
-    ("chumpy.reordering", "Select"): "Select",
+    "chumpy.ch": ("Ch",),
+    "chumpy.reordering": ("Select",),
 }
+"""Names that a pickle may use, by module."""
+ALLOWED = {(module, name): name for module, names in _NAMES.items() for name in names}
 """Names (module, name) that a pickle may use, and the kind of object that each one stands for in this module."""
 SPARSE = re.compile(r"(csc|csr|coo)_(matrix|array)")
 DTYPE = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248]|c(8|16)|[SU]\d{1,4})")

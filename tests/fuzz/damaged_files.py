@@ -59,15 +59,9 @@ def in_png(content: bytes, random: np.random.Generator) -> bytes:
         (length,) = struct.unpack_from(">I", content, place)
         chunks.append((content[place + 4 : place + 8], content[place + 8 : place + 8 + length]))
         place += 12 + length
-    chosen = int(random.integers(len(chunks)))
+    damage_part(chunks, b"IDAT", random)
     made = content[:8]
-    for number, (kind, data) in enumerate(chunks):
-        if number == chosen:
-            data = (
-                zlib.compress(spoilt(zlib.decompress(data), random))
-                if kind == b"IDAT"
-                else spoilt(data, random)
-            )
+    for kind, data in chunks:
         made += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
     return made
 
@@ -84,15 +78,19 @@ def in_mat(content: bytes, random: np.random.Generator) -> bytes:
         kind, size = struct.unpack_from("<II", content, place)
         variables.append((kind, content[place + 8 : place + 8 + size]))
         place += 8 + size
-    chosen = int(random.integers(len(variables)))
+    damage_part(variables, 15, random)
     made = content[:128]
-    for number, (kind, data) in enumerate(variables):
-        if number == chosen:
-            data = (
-                zlib.compress(spoilt(zlib.decompress(data), random)) if kind == 15 else spoilt(data, random)
-            )
+    for kind, data in variables:
         made += struct.pack("<II", kind, len(data)) + data
     return made
+
+
+def damage_part(parts: list[tuple[Any, bytes]], packed: Any, random: np.random.Generator) -> None:
+    """Damage one of the parts (kind, content) of a file; the content of the kind `packed` in its decompressed form."""
+    chosen = int(random.integers(len(parts)))
+    kind, data = parts[chosen]
+    damaged = zlib.compress(spoilt(zlib.decompress(data), random)) if kind == packed else spoilt(data, random)
+    parts[chosen] = kind, damaged
 
 
 def signed(inner: Damage) -> Damage:

@@ -13,8 +13,9 @@ For every plugin that stores arrays, a model is fitted and stored. One array of 
 the limits, cycles, another type or shape, sparse, nested, quantised and expanded tensors, positions beyond their
 storage. Then the checkpoint is loaded, and the model predicts.
 
-`--files 400 --check` is the short form for tests: it writes nothing and exits with 1 if there is a fault. `--only
-NAME` chooses readers. `--replay NUMBER` reads one file of the chosen reader again, to find the cause of a fault.
+`--files 400 --check` is the short form for tests: it writes nothing, exits with 1 if there is a fault, and prints the
+modules that guard a file. `--only NAME` chooses readers. `--replay NUMBER` reads one file of the chosen reader again,
+to find the cause of a fault.
 """
 
 import argparse
@@ -23,13 +24,17 @@ import signal
 import sys
 import time
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 
 os.environ["OMP_NUM_THREADS"] = "1"  # before anything starts threads: readers run in forks
 
 import torch
 
 from benchmarks.pages import machine, write_page
+from framework.storage.reading import translate_errors
 from tests.fuzz.damage import Reader, Tally, fuzz, outcome_of, replay, scratch
 from tests.fuzz.damaged_readers import readers
 
@@ -52,19 +57,42 @@ def main() -> int:
         replay(chosen[0], arguments.replay)
         return 0
     found: dict[str, Tally] = {}
+    guards: set[str] = set()
     began = time.perf_counter()
     for reader in chosen:
         if not reader.samples:
             continue
         count = max(1, round(reader.share * arguments.files)) if arguments.check else arguments.files
         with scratch() as folder:
-            whole(reader, folder)
+            with record_guards(guards):
+                whole(reader, folder)
             irregular(reader, folder)
             found[reader.name] = fuzz(reader, count, folder)
         tell(reader.name, found[reader.name])
         if not arguments.check and not arguments.only:
             report(found, (time.perf_counter() - began) / 60, arguments.files)
+    if arguments.check:
+        here = f"{Path(__file__).resolve().parents[2]}{os.sep}"
+        files = sorted(file.removeprefix(here) for file in guards if file.startswith(here))
+        sys.stdout.write(f"guards: {' '.join(files)}\n")
     return int(any(tally.bad for tally in found.values()))
+
+
+@contextmanager
+def record_guards(files: set[str]) -> Iterator[None]:
+    """Add to `files` the modules that guard a file (`translate_errors`) inside the block."""
+    code = translate_errors.__wrapped__.__code__  # type: ignore[attr-defined]
+
+    def record(frame: FrameType, event: str, argument: object) -> None:
+        # the caller is contextlib, and the caller of that guards the file
+        if event == "call" and frame.f_code is code:
+            files.add(frame.f_back.f_back.f_code.co_filename)  # type: ignore[union-attr]
+
+    sys.setprofile(record)
+    try:
+        yield
+    finally:
+        sys.setprofile(None)
 
 
 def whole(reader: Reader, folder: Path) -> None:

@@ -19,6 +19,14 @@ def build_encoder(shape=(40, 3), **config):
     return build("encoder", resolve("encoder", {"name": "occupancy", **config}), input_shape=shape)
 
 
+def grids_of(encoder, clouds, side):
+    """Return the features of clouds, which must be one number of the clouds' dtype for each cell."""
+    features = encoder(clouds)
+    assert features.dtype == clouds.dtype
+    assert features.shape == (len(clouds), 1, side, side, side)
+    return features
+
+
 def by_hand(cloud, side):
     """Return the occupancy by a loop over points: lower faces included, and the upper face of the last cell too."""
     occupied = np.zeros((side, side, side))
@@ -35,9 +43,7 @@ def by_hand(cloud, side):
 def test_agrees_with_a_loop(normalise, side, dtype):
     lengths = [200, 1, 30]
     clouds = batch_of(lengths, 5, dtype)
-    features = build_encoder((200, 5), side=side, normalise=normalise)(clouds)
-    assert features.dtype == dtype
-    assert features.shape == (3, 1, side, side, side)
+    features = grids_of(build_encoder((200, 5), side=side, normalise=normalise), clouds, side)
     local = normalise_clouds(clouds, normalise).clouds[..., :3].double().numpy()
     for number, length in enumerate(lengths):
         np.testing.assert_array_equal(features[number, 0].numpy(), by_hand(local[number, :length], side))

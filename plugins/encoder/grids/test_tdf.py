@@ -11,6 +11,7 @@ from framework.errors import ConfigError
 from framework.geometry.clouds import normalise_clouds, sizes
 from framework.testing.cloud_encoders import batch_of
 from plugins.encoder.grids.tdf import decode, truncated_distance
+from plugins.encoder.grids.test_occupancy import grids_of
 
 DTYPES = [torch.float32, torch.float64]
 
@@ -35,9 +36,7 @@ def by_hand(cloud, side, truncation):
 def test_agrees_with_a_loop(side, truncation, dtype):
     lengths = [100, 1, 30]
     clouds = batch_of(lengths, 5, dtype)
-    features = build_encoder((100, 5), side=side, truncation=truncation)(clouds)
-    assert features.dtype == dtype
-    assert features.shape == (3, 1, side, side, side)
+    features = grids_of(build_encoder((100, 5), side=side, truncation=truncation), clouds, side)
     local = normalise_clouds(clouds, "unit_ball").clouds[..., :3].double().numpy()
     for number, length in enumerate(lengths):
         wanted = by_hand(local[number, :length], side, truncation)
