@@ -125,9 +125,9 @@ def boost(file: Path, task: str, seed: int) -> dict[str, Any]:
         chosen = [labels.index(str(label)) for label in target[test]]
         probability = model.predict_proba(inputs[test])[np.arange(len(test)), chosen]
         return {"log_likelihood": float(np.log(probability.clip(1e-300)).mean())}
-    own, held = train_test_split(rows, test_size=0.1, random_state=0)
+    own, held_out = train_test_split(rows, test_size=0.1, random_state=0)
     model = GradientBoostingRegressor(random_state=0).fit(inputs[own], target[own])
-    deviation = np.sqrt(np.square(target[held] - model.predict(inputs[held])).mean())
+    deviation = np.sqrt(np.square(target[held_out] - model.predict(inputs[held_out])).mean())
     log_prob, below = (
         function(target[test], model.predict(inputs[test]), deviation)
         for function in (stats.norm.logpdf, stats.norm.cdf)

@@ -156,14 +156,14 @@ def peers(root: Path, name: str) -> None:
     from framework.configuration.schema import build, resolve
 
     def constant(model: Callable[[], Any]) -> Callable[..., tuple[Any, Any]]:
-        """Return a fit of a model of the mean, with a normal density whose deviation is that of held-out rows."""
+        """Return a fit of a model of the mean, with a normal density whose deviation is that of held_out-out rows."""
 
         def fit(inputs: Any, target: Any, new: Any) -> tuple[Any, Any]:
-            own, held, own_target, held_target = train_test_split(
+            own, held_out, own_target, held_out_target = train_test_split(
                 inputs, target, test_size=0.1, random_state=0
             )
             fitted = model().fit(own, own_target)
-            deviation = np.sqrt(np.square(held_target - fitted.predict(held)).mean())
+            deviation = np.sqrt(np.square(held_out_target - fitted.predict(held_out)).mean())
             return fitted.predict(new), np.full(len(new), deviation)
 
         return fit
@@ -171,9 +171,11 @@ def peers(root: Path, name: str) -> None:
     def ngboost(inputs: Any, target: Any, new: Any) -> tuple[Any, Any]:
         from ngboost import NGBRegressor  # type: ignore[import-not-found]
 
-        own, held, own_target, held_target = train_test_split(inputs, target, test_size=0.1, random_state=0)
+        own, held_out, own_target, held_out_target = train_test_split(
+            inputs, target, test_size=0.1, random_state=0
+        )
         model = NGBRegressor(n_estimators=700, learning_rate=0.04, verbose=False, random_state=0)
-        model.fit(own, own_target, X_val=held, Y_val=held_target, early_stopping_rounds=50)
+        model.fit(own, own_target, X_val=held_out, Y_val=held_out_target, early_stopping_rounds=50)
         predicted = model.pred_dist(new)
         return predicted.params["loc"], predicted.params["scale"]
 
