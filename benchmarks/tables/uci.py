@@ -156,7 +156,7 @@ def peers(root: Path, name: str) -> None:
     from framework.configuration.schema import build, resolve
 
     def constant(model: Callable[[], Any]) -> Callable[..., tuple[Any, Any]]:
-        """Return a fit of a model of the mean, with a normal density whose deviation is that of held_out-out rows."""
+        """Return a fit of a model of the mean, with a normal density whose deviation is that of held-out rows."""
 
         def fit(inputs: Any, target: Any, new: Any) -> tuple[Any, Any]:
             own, held_out, own_target, held_out_target = train_test_split(
