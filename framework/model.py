@@ -186,6 +186,14 @@ class Backbones(Encoder):
         return torch.cat([network(inputs) for network in self.networks], 1)
 
 
+class RawNetwork(nn.Module):
+    """Base class of a module other than `Model` that computes raw parameters from inputs, such as those of members.
+
+    A frozen predictor may compute it by other means than torch: its results must be a function of its inputs, and of
+    the number of members that is its second argument.
+    """
+
+
 Computed = TypeVar("Computed")
 
 

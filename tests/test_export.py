@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,26 +38,35 @@ from framework.testing.finding import seed
 from framework.testing.rows import HeadRow
 from tests.conftest import Framework
 
-NOT_EXPORTED = {
-    "cvae": "LatentDensity",
-    "scvae": "SampledMixture|LatentDensity",
-    "matrix_fisher": "MatrixFisher",
-    "mixture of matrix_fisher": "MatrixFisher",
-    "uniform_floor of matrix_fisher": "MatrixFisher",
-    "hybrid of cvae": "LatentDensity",
-    "lstm": "torch.export cannot follow its computation",
-}
-"""Heads that are refused, with words of the reason; heads that are fitted in one step are no networks."""
-
-
 FITTED = ("ballistic", "extra_trees", "fit_pose", "lorentzian", "xgboost")
 """Heads that are fitted in one step; they are no networks."""
-HEADS = [name for name in installed("density_head") if name not in FITTED]
+REFUSED_HEADS = {"quantiles": "A PiecewiseQuantiles cannot be exported"}
+"""Heads whose densities have no NumPy code, with words of the refusal."""
+HEADS = [name for name in installed("density_head") if name not in (*FITTED, *REFUSED_HEADS)]
 
 
-def rows(name: str, *, refused: bool = False) -> list[HeadRow]:
-    """Return the contract rows of a head that are exported, or all of them."""
-    return [row for row in contract("density_head", name).rows if refused or reason(name, row) is None]
+REFUSED_ENCODERS = {
+    "points": "random choice of points|order of the farthest points",
+    "pointnet2": "order of the farthest points",
+    "projection": "Its part Projection is no sequence of operations",
+    "rasterised": "Its part Rasterised is no sequence of operations|does not accept the random inputs",
+    "ballistic": "Its part BallisticEncoder is no sequence of operations|does not accept the random inputs",
+    "extrapolation": "Its part ExtrapolationEncoder is no sequence of operations|does not accept the random inputs",
+    "unet: odd size": "A crop depends on the pixels",
+    "unet: over its input": "A crop depends on the pixels",
+    "slim: odd size": "A crop depends on the pixels",
+    "slim: over its input": "A crop depends on the pixels",
+    "slim: a scale, squares of 4": "A crop depends on the pixels",
+    "bps: rotation-invariant": "axes of a cloud are eigenvectors",
+}
+"""Encoders, or single rows of them, that are refused, with words of the reason."""
+ROUNDED = ("hybrid",)
+"""Heads whose rows with random weights may be refused because of their rounding for extreme inputs."""
+
+
+def rows(name: str) -> list[HeadRow]:
+    """Return the contract rows of a head."""
+    return list(contract("density_head", name).rows)
 
 
 def build_head(name: str, row: HeadRow) -> DensityHead:
@@ -66,13 +76,6 @@ def build_head(name: str, row: HeadRow) -> DensityHead:
         "density_head", resolve("density_head", {"name": name, **row.config}), target=row.target
     )
     return head.eval().requires_grad_(False)
-
-
-def reason(name: str, row: HeadRow) -> str | None:
-    """Return words of the reason for which a head is refused; None if it is exported."""
-    component = row.config.get("component")
-    inner = component.get("name") if isinstance(component, dict) else None
-    return NOT_EXPORTED.get(f"{name} of {inner}") or NOT_EXPORTED.get(name)
 
 
 def as_numpy(density: Distribution) -> Density:
@@ -102,18 +105,28 @@ def compare_densities(name: str, row: HeadRow, spread: float) -> None:
     generator = torch.Generator().manual_seed(1)
     raw = spread * torch.randn(5, *head.raw_shape, generator=generator, dtype=torch.float64)
     density = head(raw)
+    estimated = any(exported(density).remarks())
+    if estimated:  # NumPy has the mixture of the drawn components in place of an estimate
+        density = getattr(density, "mixture", density)
     own = as_numpy(density)
     assert (own.batch, own.event) == (tuple(density.batch_shape), tuple(density.event_shape))
     torch.manual_seed(0)
     values = density.sample(torch.Size((9,)))
-    expected = density.log_prob(values).double().numpy()
-    np.testing.assert_allclose(own.log_prob(values.double().numpy()), expected, rtol=1e-9, atol=1e-9)
-    # the most likely value is at least as likely as torch's
-    mode = torch.as_tensor(own.mode()).to(values.dtype)
-    assert bool((density.log_prob(mode) >= density.log_prob(density.mode) - 1e-6).all())
+    if not any(exported(density).remarks()):
+        expected = density.log_prob(values).double().numpy()
+        np.testing.assert_allclose(own.log_prob(values.double().numpy()), expected, rtol=1e-9, atol=1e-9)
+    if own.by_draws and isinstance(own, densities.Mixture):
+        with pytest.raises(ValueError, match="The mode of a mixture of these densities is not known"):
+            own.mode()
+    elif not estimated:
+        # the most likely value is at least as likely as torch's
+        mode = torch.as_tensor(own.mode()).to(values.dtype)
+        assert bool((density.log_prob(mode) >= density.log_prob(density.mode) - 1e-6).all())
     entropy = own.entropy()
     away = np.abs(entropy.value - density.entropy().double().numpy())
-    several = entropy.error.any()  # draws, and torch's entropy is estimated from about 1000 of its own
+    several = (
+        estimated or entropy.error.any()
+    )  # draws, and torch's entropy is estimated from about 1000 of its own
     assert (away <= (8 * entropy.error + 0.3 if several else 1e-7 * (1 + np.abs(entropy.value)))).all()
     draws = own.sample(np.random.default_rng(0), 4000)
     assert draws.shape == (4000, *own.batch, *own.event)
@@ -140,6 +153,9 @@ def compare_intervals(name: str, row: HeadRow, mass: float) -> None:
     raw = torch.randn(4, head.size, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     density = head(raw)
     own = as_numpy(density)
+    if own.by_draws:
+        assert abs(share_between(own, density, mass) - mass) < 0.03
+        return
     expected = central_interval(density, mass)
     assert not (expected.low_error != 0).any()
     ends = own.interval(mass)
@@ -152,6 +168,15 @@ def compare_intervals(name: str, row: HeadRow, mass: float) -> None:
         np.testing.assert_allclose(
             own.median(), median(density, 1000).numpy(), rtol=0, atol=0.2 * scale.max()
         )
+
+
+def share_between(own: Density, density: Distribution, mass: float) -> float:
+    """Return the share of draws of torch between the ends of NumPy's intervals, which are those of draws."""
+    torch.manual_seed(0)
+    draws = density.sample(torch.Size((4000,))).double().numpy()
+    ends = own.interval(mass)
+    inside = np.mod(draws - ends.low, 2 * math.pi) <= ends.high - ends.low
+    return float(inside.mean())
 
 
 @pytest.mark.parametrize(
@@ -228,31 +253,121 @@ def model_of(name: str, row: HeadRow) -> tuple[Predictor, tuple[int, ...]]:
     return Model([encoder], head).eval(), (6,)
 
 
-def check_export(name: str, row: HeadRow, into: Path) -> None:
-    """Export a model with this head, or see it refused with the reason in NOT_EXPORTED."""
-    words = reason(name, row)
-    model, shape = model_of(name, row)
-    if words is not None:
-        with pytest.raises(ConfigError, match=words):
-            exporting.export(model, describe(shape, row.target), into)
-        assert not into.exists()
-        return
-    content = exporting.export(model, describe(shape, row.target), into)
-    assert max(numbers["parameters"] for numbers in content["parity"].values()) <= 1e-5
-
-
 @pytest.mark.usefixtures("arrays")
 @pytest.mark.parametrize("name", ["gaussian", "mixture"])
 def test_an_exported_network_computes_the_same_parameters(name: str, tmp_path: Path) -> None:
     check_export(name, rows(name)[0], tmp_path / "model")
 
 
+def check_export(name: str, row: HeadRow, into: Path) -> None:
+    """Export a model with this head, and see that the differences are small."""
+    model, shape = model_of(name, row)
+    try:
+        content = exporting.export(model, describe(shape, row.target), into)
+    except ConfigError as error:
+        # float32 itself does not resolve all parameters for extreme inputs, on some processors
+        assert name in ROUNDED and "1e-05 is allowed" in str(error) and "extreme inputs" in str(error)
+        return
+    assert max(numbers["parameters"] for numbers in content["parity"].values()) <= 1e-5
+    require_no_other_imports(into)
+
+
+def require_no_other_imports(folder: Path) -> None:
+    """Require that the Python files of an exported folder import only each other and a few packages."""
+    imports = re.findall(
+        r"^ *(?:from|import) (\w+)", "".join(file.read_text() for file in folder.glob("*.py")), re.M
+    )
+    own = {file.stem for file in folder.glob("*.py")} | {"numpy", "onnxruntime", "fastapi", "uvicorn"}
+    assert set(imports) - own <= set(sys.stdlib_module_names)
+
+
+@pytest.mark.usefixtures("arrays")
+@pytest.mark.parametrize("name", REFUSED_HEADS)
+def test_a_head_without_numpy_code_is_refused(name: str, tmp_path: Path) -> None:
+    model, shape = model_of(name, rows(name)[0])
+    with pytest.raises(ConfigError, match=REFUSED_HEADS[name]):
+        exporting.export(model, describe(shape, rows(name)[0].target), tmp_path / "model")
+    assert not (tmp_path / "model").exists()
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("arrays")
 @pytest.mark.parametrize("name", HEADS)
-def test_every_head_is_exported_or_refused_with_its_reason(name: str, tmp_path: Path) -> None:
-    for number, row in enumerate(rows(name, refused=True)):
+def test_every_head_is_exported(name: str, tmp_path: Path) -> None:
+    for number, row in enumerate(rows(name)):
         check_export(name, row, tmp_path / str(number))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("arrays")
+@pytest.mark.parametrize("name", installed("encoder"))
+def test_every_encoder_is_exported_or_refused_with_its_reason(name: str, tmp_path: Path) -> None:
+    target = Target("class", ("a", "b", "c"))
+    head = build("density_head", resolve("density_head", {"name": "categorical"}), target=target)
+    for number, row in enumerate(contract("encoder", name).rows):
+        seed(0)
+        config = resolve("encoder", {"name": name, **row.config})
+        encoder = build("encoder", config, input_shape=row.input_shape, input_columns=row.columns)
+        flat = build(
+            "encoder", resolve("encoder", {"name": "mlp", "widths": [8]}), input_shape=encoder.output_shape
+        )
+        model = Model([encoder, flat], head).eval()
+        description = replace(describe(row.input_shape, target), columns=row.columns)
+        words = REFUSED_ENCODERS.get(name) or REFUSED_ENCODERS.get(f"{name}: {row.name}")
+        into = tmp_path / str(number)
+        if words is None:
+            content = exporting.export(model, description, into)
+            assert max(numbers["parameters"] for numbers in content["parity"].values()) <= 1e-5
+        else:
+            with pytest.raises(ConfigError, match=words):
+                exporting.export(model, description, into)
+            assert not into.exists()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("arrays")
+def test_predictions_do_not_depend_on_the_other_inputs_of_a_batch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Clouds are padded with NaN, and random numbers are the same for every input and depend on the seed alone."""
+    target = Target("class", ("a", "b", "c"))
+    row = contract("encoder", "deepsets").rows[0]
+    encoder = build("encoder", resolve("encoder", {"name": "deepsets", **row.config}), input_shape=(40, 3))
+    scvae = build(
+        "density_head", resolve("density_head", {"name": "scvae", "component": "categorical"}), target=target
+    )
+    exporting.export(Model([encoder], scvae).eval(), describe((40, 3), target), tmp_path / "model")
+    monkeypatch.syspath_prepend(str(tmp_path / "model"))
+    model = importlib.import_module("predict").load(tmp_path / "model")
+    generator = np.random.default_rng(0)
+    clouds = [generator.normal(size=(count, 3)) for count in (40, 7, 90)]
+    together = model(clouds).probabilities
+    for cloud, expected in zip(clouds, together, strict=True):
+        np.testing.assert_allclose(model([cloud]).probabilities[0], expected, rtol=1e-5, atol=1e-6)
+        np.testing.assert_array_equal(model([cloud]).probabilities, model([cloud]).probabilities)
+    assert np.abs(model(clouds, seed=1).probabilities - together).max() > 1e-6
+
+    network = build("encoder", resolve("encoder", {"name": "mlp", "dropout": 0.5}), input_shape=(6,))
+    head = build("density_head", resolve("density_head", "categorical"), target=target)
+    part = resolve("uncertainty", {"name": "mc_dropout", "samples": 5})
+    wrapper = build("uncertainty", part, model=lambda: Model([network], head), target=target).eval()
+    exporting.export(wrapper, describe((6,), target), tmp_path / "dropout")
+    dropout = importlib.import_module("predict").load(tmp_path / "dropout")
+    numbers = generator.normal(size=(3, 6))
+    alone = [dropout(row[None]).probabilities[0] for row in numbers]
+    np.testing.assert_allclose(dropout(numbers).probabilities, alone, rtol=1e-5, atol=1e-6)
+    assert np.abs(dropout(numbers, seed=1).probabilities - alone).max() > 1e-6
+
+    for bad, words in (
+        ([np.zeros((0, 3))], "Cloud 0 has no point"),
+        ([clouds[0], np.full((3, 3), np.nan)], "Cloud 1 has no point"),
+        ([np.array([[0, 0, 0], [0, np.inf, 0]])], "Point 1 of cloud 0 is not finite"),
+        ([[[1, 2]]], "reads inputs of shape"),
+        ([[1, 2, 3]], "Clouds must be arrays"),
+        ([[["x", 2, 3]]], "no array of numbers"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            model(bad)
 
 
 def test_the_exported_folder_needs_numpy_and_onnxruntime_alone(framework: Framework, tmp_path: Path) -> None:
@@ -308,11 +423,7 @@ def test_the_exported_folder_needs_numpy_and_onnxruntime_alone(framework: Framew
         early.stdout.close()
         assert b"Traceback" not in early.stderr.read()
 
-    imports = re.findall(
-        r"^(?:from|import) (\w+)", "".join(file.read_text() for file in folder.glob("*.py")), re.M
-    )
-    own = {file.stem for file in folder.glob("*.py")} | {"numpy", "onnxruntime", "fastapi", "uvicorn"}
-    assert set(imports) - own <= set(sys.stdlib_module_names)
+    require_no_other_imports(folder)
     again = framework(
         "mode=export", f"checkpoint={done.folder}", f"mode.into={folder}", "logger=none", folder="again"
     )
@@ -326,6 +437,8 @@ MALFORMED = (
     b'{"inputs": [[1, 2, 3, 4, 5, "x"]]}',
     b'{"inputs": [[1, 2, 3, 4, 5, 6]], "interval": 2}', b'{"inputs": [[1, 2, 3, 4, 5, 6]], "interval": "x"}',
     b'{"inputs": [[1, 2, 3, 4, 5, 6]], "other": 1}', b'{"inputs": [[[[[[[[[[1]]]]]]]]]]}',
+    b'{"inputs": [[' + b"9" * 5000 + b"]]}", b"\x93NUMPY\x01\x00\x05\x00{[(,\n",
+    b"\x93NUMPY\x01\x00\x46\x00{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000000,), }  ",
 )  # fmt: skip
 """Bodies of requests that must be refused."""
 

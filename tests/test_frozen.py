@@ -1,6 +1,7 @@
 """Frozen models give the numbers of their predictors; fully connected networks run without the model."""
 
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -161,11 +162,17 @@ class Squared(Encoder):
         return self.layer(inputs).square() if inputs.sum() > 0 else self.layer(inputs)
 
 
-@pytest.mark.parametrize("kind", [Twice, Squared])
-def test_what_is_no_chain_of_layers_is_left_to_torch(kind):
+@pytest.mark.parametrize(
+    "kind, form_of_network",
+    [
+        (Twice, "1 network in ONNX Runtime, then CategoricalHead in torch"),
+        (Squared, "Model in torch, without gradient"),  # a branch that depends on values is never traced
+    ],
+)
+def test_what_is_no_chain_of_layers_is_left_to_onnx_runtime_or_torch(kind, form_of_network):
     model = trained([kind(4)], head("categorical", SEVEN), (4,))
     form = freeze_predictor(model, (4,))
-    assert "in torch, without gradient" in form.form
+    assert form.form == form_of_network
     assert read_network(model, (4,)) is None
     same(form, model, torch.randn(5, 4))
     assert not form.density(torch.randn(5, 4)).logits.requires_grad
@@ -233,8 +240,11 @@ def test_wrappers_are_run_as_they_are():
     resolved = resolve("uncertainty", {"name": "ensemble", "members": 3})
     predictor = build("uncertainty", resolved, model=one, target=SEVEN).eval()
     form = freeze_predictor(predictor, (6,))
-    assert form.form == "Ensemble in torch, without gradient"
-    same(form, predictor, torch.randn(4, 6))
+    assert form.form == "1 network in ONNX Runtime, then Ensemble in torch"
+    for count in (1, 4):
+        same(form, predictor, torch.randn(count, 6))
+    form.inner.members = predictor.members = 2
+    same(pickle.loads(pickle.dumps(form)), predictor, torch.randn(4, 6))
 
 
 def test_heads_fitted_at_once_are_run_as_they_are():

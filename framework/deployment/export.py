@@ -9,17 +9,16 @@ original model on random and extreme inputs, and nothing is written if they diff
 import copy
 import importlib
 import json
-import logging
+import math
 import shutil
 import tempfile
 import time
-import warnings
-from collections.abc import Callable, Mapping
-from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib.util import find_spec
 from inspect import getsource
-from io import StringIO
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -27,16 +26,17 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.fx import GraphModule
 
 from framework.configuration.description import Description
 from framework.configuration.loading import reader
 from framework.data import Preprocessing
 from framework.deployment import exported_folder
 from framework.deployment.frozen import freeze_predictor
+from framework.deployment.onnx_programs import PACKAGES, Session, quiet_export, write_onnx
 from framework.distributions.exported import NUMPY, Exported, exported
+from framework.distributions.given_draws import Noise, given_draws
 from framework.distributions.numpy_densities import build
-from framework.errors import ConfigError, shorten
+from framework.errors import ConfigError, DataError, NonFiniteParameters, UserError, shorten
 from framework.model import Predictor
 from framework.target import Target
 
@@ -52,8 +52,12 @@ PACKAGE = exported_folder.__name__
 """Package of the scripts."""
 EXTREMES = {"random": 1.0, "extreme": 1e4}
 """Factors of the spread of the arrays on which the exported model is compared with the original one."""
-BATCH = 16
-RANDOM = "It draws random numbers, so the same input has another density each time."
+BATCH, FEWER = 16, 5
+"""Numbers of inputs with which a model is tried."""
+RANDOM = "It draws random numbers by other functions than torch.rand, torch.randn and dropout layers."
+VARYING = "How many random numbers it draws depends on its inputs."
+MOST_NOISE = 2**22
+"""Largest number of random numbers for one input."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,20 @@ class Exporting:
     description: Description
     preprocessing: Preprocessing | None
 
+    @cached_property
+    def cloud(self) -> bool:
+        """True if the inputs are point clouds that the model reads with rows of NaN as padding."""
+        if len(self.description.input_shape) != 2 or self.description.columns[:3] not in (
+            (),
+            ("x", "y", "z"),
+        ):
+            return False
+        try:
+            form = self.form(self.arrays(2, 1.0, padded=True))
+        except (DataError, ValueError, torch.linalg.LinAlgError):
+            return False
+        return all(bool(tensor.isfinite().all()) for _, tensor in form.tensors())
+
     @property
     def dtype(self) -> torch.dtype:
         """Data type of the arrays that the exported model reads."""
@@ -78,8 +96,15 @@ class Exporting:
         # pixels are bytes
         return torch.uint8 if len(self.description.input_shape) == 3 else torch.float32
 
-    def arrays(self, count: int, spread: float, seed: int = 0) -> Tensor:
-        """Return random arrays that a user might give, (count, *input_shape)."""
+    def arrays(self, count: int, spread: float, seed: int = 0, padded: bool | None = None) -> Tensor:
+        """Return random arrays that a user might give, (count, *input_shape).
+
+        Args:
+            count: number of arrays.
+            spread: factor of their usual spread.
+            seed: seed of the random numbers.
+            padded: whether every second array ends with rows of NaN; None stands for `cloud`.
+        """
         generator = torch.Generator().manual_seed(seed)
         shape = (count, *self.description.input_shape)
         if self.dtype == torch.uint8:
@@ -88,9 +113,26 @@ class Exporting:
                 return level.reshape(-1, *(1,) * (len(shape) - 1)).expand(shape).to(torch.uint8).contiguous()
             return torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8)
         noise = spread * torch.randn(shape, generator=generator, dtype=torch.float64)
+        if self.cloud if padded is None else padded:
+            noise[::2, (shape[1] + 1) // 2 :] = torch.nan  # rows of NaN are padding
         if self.preprocessing is not None:
             noise = self.preprocessing.location + self.preprocessing.scale * noise
         return noise.to(self.dtype)
+
+    @torch.no_grad()
+    def accepted_arrays(self, count: int, spread: float) -> Tensor:
+        """Return random arrays that the model accepts.
+
+        An encoder may require that point clouds lie in the unit ball. In extreme ones, every point is one of the eight
+        corners of a cube in this ball, so that most points are equal.
+        """
+        arrays = self.arrays(count, spread, seed=count)
+        if self.cloud:
+            try:
+                self.density(arrays)
+            except UserError:
+                return arrays.sign() / math.sqrt(3)
+        return arrays
 
     def inputs(self, arrays: Tensor) -> Tensor:
         """Return the inputs that the original model reads for a user's arrays."""
@@ -102,21 +144,36 @@ class Exporting:
         """Return the densities of the original model for a user's arrays, as `framework.load` computes them."""
         return self.predictor(self.inputs(arrays))
 
+    @torch.no_grad()
+    def form(self, arrays: Tensor, noise: Sequence[Tensor | None] | None = None) -> Exported:
+        """Return the parameters of these densities, computed with given random numbers (`given_draws`)."""
+        with given_draws(noise):
+            return exported(self.density(arrays))
+
 
 class Traced(nn.Module):
-    """Module from a user's arrays to the parameters of the density, which torch.export traces."""
+    """Module from a user's arrays to the parameters of the density, which torch.export traces.
 
-    def __init__(self, model: Exporting) -> None:
+    Args:
+        model: the model.
+        used: whether each array of random numbers that the model draws is given to `forward`; the parameters of the
+            density do not depend on the others.
+    """
+
+    def __init__(self, model: Exporting, used: Sequence[bool]) -> None:
         super().__init__()
         self.predictor = model.predictor
         self.preprocessing = nn.Identity() if model.preprocessing is None else model.preprocessing.module
         floats = (parameter.dtype for parameter in model.predictor.parameters())
         self.kind = model.dtype if model.dtype == torch.uint8 else next(floats, torch.float32)
+        self.used = used
 
-    def forward(self, arrays: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, arrays: Tensor, noise: Sequence[Tensor] = ()) -> tuple[Tensor, ...]:
         """Return the parameters of the density, in the order of `Exported.tensors`."""
-        density = self.predictor(self.preprocessing(arrays).to(self.kind))
-        return tuple(tensor.clone() for _, tensor in exported(density).tensors())
+        parts = iter(noise)
+        with given_draws([next(parts) if needed else None for needed in self.used]):
+            form = exported(self.predictor(self.preprocessing(arrays).to(self.kind)))
+        return tuple(tensor.clone() for _, tensor in form.tensors())
 
 
 def export(predictor: Predictor, description: Description, into: Path) -> Mapping[str, Any]:
@@ -135,30 +192,37 @@ def export(predictor: Predictor, description: Description, into: Path) -> Mappin
         raise ConfigError(f"{into} is not empty. Name a new folder, or empty this one.")
     bare = _without_hooks(predictor)
     model = Exporting(bare, description, reader(description).preprocessing())
-    with torch.no_grad():  # with the hooks of loading, which bound the memory that a stored model may take
-        predictor(model.inputs(model.arrays(BATCH, 1.0)))
-    form = _form(model)
+    try:
+        with (
+            torch.no_grad()
+        ):  # with the hooks of loading, which bound the memory that a stored model may take
+            predictor(model.inputs(model.arrays(BATCH, 1.0, padded=False)))
+    except (DataError, NonFiniteParameters) as error:
+        reason = "It does not accept the random inputs on which an exported model is compared with it"
+        raise _refusal(model, f"{reason}: {shorten(error)}") from error
+    form, noises = _form(model)
     layout, names = form.layout(), [name for name, _ in form.tensors()]
     modules = sorted(set(form.modules()))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        _write_network(model, names, folder / "model.onnx")
-        session = open_session(folder / "model.onnx")
-        parity = _compare(model, session, layout, names, modules)
+        session, shape = _write_network(model, noises, names, folder / "model.onnx")
+        parity = _compare(model, session, noises, form, names)
         code = _write_code(modules, folder)
         content = {
             "format": FORMAT,
             "model": description.method or type(predictor).__name__,
             "trained_on": description.config["data"]["name"],
             "synthetic": description.synthetic,
-            "input": _input_entry(model),
+            "input": _input_entry(model, shape),
+            "noise": [noise.entry() for noise in noises if noise.name],
             "target": target_entry(description.target),
             "density": layout,
             "outputs": names,
             "modules": code,
             "calibration": list(description.remarks),
+            "remarks": sorted(set(form.remarks())),
             "parity": parity,
-            "milliseconds": _latency(model, session),
+            "milliseconds": _latency(model, session, noises),
         }
         (folder / "density.json").write_text(
             json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8"
@@ -175,7 +239,7 @@ def require_packages() -> None:
     Raises:
         ConfigError: onnx, onnxscript or onnxruntime is not installed.
     """
-    missing = [name for name in ("onnx", "onnxscript", "onnxruntime") if find_spec(name) is None]
+    missing = [name for name in PACKAGES if find_spec(name) is None]
     if missing:
         raise ConfigError(f"mode=export needs the package {missing[0]}, which is not installed. Run {EXTRA}.")
 
@@ -189,9 +253,51 @@ def _without_hooks(predictor: Predictor) -> Predictor:
     return bare
 
 
+@dataclass(frozen=True)
+class ModelNoise:
+    """Random numbers that a model draws for a batch.
+
+    Attributes:
+        name: name of the exported model's input for these numbers; "" if the density does not depend on them.
+        kind: as in `Noise`.
+        shape: length of each dimension; a text such as "50 * batch" stands for a multiple of the number of inputs.
+        dtype: data type.
+    """
+
+    name: str
+    kind: str
+    shape: tuple[int | str, ...]
+    dtype: torch.dtype
+
+    def draw(self, count: int, seed: int) -> Tensor:
+        """Return such numbers for `count` inputs."""
+        shape = tuple(
+            size if isinstance(size, int) else count * multiple_of_batch(size) for size in self.shape
+        )
+        return Noise(self.kind, shape, self.dtype).draw(torch.Generator().manual_seed(seed))
+
+    def dynamic_shape(self, batch: Any) -> dict[int, Any]:
+        """Return the dimensions that depend on the number of inputs, as torch.export wants them."""
+        return {
+            axis: multiple_of_batch(size) * batch
+            for axis, size in enumerate(self.shape)
+            if isinstance(size, str)
+        }
+
+    def entry(self) -> dict[str, Any]:
+        """Return the description in density.json."""
+        dtype = str(self.dtype).removeprefix("torch.")
+        return {"name": self.name, "kind": self.kind, "shape": list(self.shape), "dtype": dtype}
+
+
+def multiple_of_batch(size: str) -> int:
+    """Return 50 for "50 * batch"."""
+    return int(size.partition(" ")[0])
+
+
 @torch.no_grad()
-def _form(model: Exporting) -> Exported:
-    """Return the parameters of the model's density for a batch of arrays.
+def _form(model: Exporting) -> tuple[Exported, list[ModelNoise]]:
+    """Return the parameters of the model's density for a batch of arrays, and the random numbers that it draws.
 
     Raises:
         ConfigError: the density cannot be exported, or two calls give different densities.
@@ -200,16 +306,48 @@ def _form(model: Exporting) -> Exported:
     batch = reader(model.description).user_batch(arrays.numpy())
     if reader(model.description).frame(batch) is not None:
         raise _refusal(model, "Its targets are given in a frame that is computed from each input.")
-    draws: list[list[Tensor]] = []
-    form = None
+    noises = _noises(model, arrays)
+    numbers: list[Tensor | None] = [noise.draw(BATCH, number) for number, noise in enumerate(noises)]
+    forms = []
     for seed in (0, 1):
         torch.manual_seed(seed)
-        form = exported(model.density(arrays))
-        draws.append([tensor for _, tensor in form.tensors()])
-    if not all(torch.equal(first, second) for first, second in zip(*draws, strict=True)):
+        forms.append(model.form(arrays, numbers))
+    if not _equal(*forms):
         raise _refusal(model, RANDOM)
-    assert form is not None
-    return form
+    named = []
+    for number, noise in enumerate(noises):
+        others = [*numbers[:number], noise.draw(BATCH, 1000 + number), *numbers[number + 1 :]]
+        unused = _equal(forms[0], model.form(arrays, others))
+        named.append(replace(noise, name="" if unused else f"noise{number}"))
+    return forms[0], named
+
+
+def _noises(model: Exporting, arrays: Tensor) -> list[ModelNoise]:
+    """Return the random numbers that a model draws, from the draws for two batches of different sizes."""
+    noises_by_batch = []
+    for part in (arrays, arrays[:FEWER]):
+        with torch.no_grad(), given_draws() as noises:
+            exported(model.density(part))
+        noises_by_batch.append(noises)
+    if len(noises_by_batch[0]) != len(noises_by_batch[1]):
+        raise _refusal(model, VARYING)
+    result = []
+    for many, few in zip(*noises_by_batch, strict=True):
+        shape: list[int | str] = []
+        for size, other in zip(many.shape, few.shape, strict=True):
+            if size != other and (size * FEWER != other * BATCH or size % BATCH):
+                raise _refusal(model, VARYING)
+            shape.append(size if size == other else f"{size // BATCH} * batch")
+        noise = ModelNoise("", many.kind, tuple(shape), many.dtype)
+        if noise.draw(1, 0).numel() > MOST_NOISE:
+            raise _refusal(model, f"It draws more than {MOST_NOISE:,} random numbers for one input.")
+        result.append(noise)
+    return result
+
+
+def _equal(first: Exported, second: Exported) -> bool:
+    pairs = zip(first.tensors(), second.tensors(), strict=True)
+    return all(torch.equal(tensor, other) for (_, tensor), (_, other) in pairs)
 
 
 def _refusal(model: Exporting, reason: str) -> ConfigError:
@@ -219,83 +357,93 @@ def _refusal(model: Exporting, reason: str) -> ConfigError:
     )
 
 
-def _write_network(model: Exporting, names: list[str], file: Path) -> None:
-    """Trace the model and write it as ONNX.
+def _write_network(
+    model: Exporting, noises: Sequence[ModelNoise], names: list[str], file: Path
+) -> tuple[Session, tuple[int | str, ...]]:
+    """Trace the model, and write it as ONNX.
+
+    Returns:
+        A session of ONNX Runtime, and the shape of an input, in which the number of points of a cloud is a word.
 
     Raises:
         ConfigError: torch cannot trace a part of the model, or ONNX has no form for it.
     """
-    traced = Traced(model).eval()
+    traced = Traced(model, [bool(noise.name) for noise in noises]).eval()
+    used = [noise for noise in noises if noise.name]
     arrays = model.arrays(2, 1.0)
-    batch = {0: torch.export.Dim("batch", min=1)}
-    printed = StringIO()
-    with warnings.catch_warnings(), redirect_stdout(printed), redirect_stderr(printed), torch.no_grad():
-        warnings.simplefilter("ignore")
-        previous = logging.root.manager.disable
-        logging.disable(logging.ERROR)
+    batch = torch.export.Dim("batch", min=1)
+    dynamic: tuple[Any, ...] = ({0: batch, **({1: torch.export.Dim.AUTO} if model.cloud else {})},)
+    arguments: tuple[Any, ...] = (arrays,)
+    if used:
+        arguments = (arrays, tuple(noise.draw(2, number) for number, noise in enumerate(used)))
+        dynamic = (*dynamic, tuple(noise.dynamic_shape(batch) for noise in used))
+    with quiet_export():
         try:
-            program = torch.export.export(traced, (arrays,), dynamic_shapes=(batch,), strict=False)
-            # a density may draw an empty sample to learn its type; ONNX has no form for such draws
-            _remove_unused(program.graph_module)
-            written = torch.onnx.export(
-                program, input_names=["input"], output_names=names, verbose=False, optimize=True
-            )
-            assert written is not None
-            written.save(str(file))
+            program = torch.export.export(traced, arguments, dynamic_shapes=dynamic, strict=False)
+            write_onnx(program, ["input", *(noise.name for noise in used)], names, str(file))
+            session = Session(file)
         except Exception as error:
-            raise _refusal(
-                model, f"torch.export cannot follow its computation ({shorten(_cause(error), 200)})."
-            ) from error
-        finally:
-            logging.disable(previous)
+            raise _refusal(model, _reason(error)) from error
+    first = next(iter(program.graph_signature.user_inputs))
+    node = next(node for node in program.graph.nodes if node.name == first)
+    value: Any = node.meta["val"]
+    lengths: tuple[Any, ...] = tuple(value.shape[1:])
+    return session, tuple(length if isinstance(length, int) else "points" for length in lengths)
 
 
-def _remove_unused(traced: GraphModule) -> None:
-    """Remove operations whose results are not used, also draws of random numbers."""
-    for node in reversed(list(traced.graph.nodes)):
-        if node.op in ("call_function", "get_attr") and not node.users and "assert" not in str(node.target):
-            traced.graph.erase_node(node)
-    traced.delete_all_unused_submodules()
+def _reason(error: BaseException) -> str:
+    """Return the reason for which a model cannot be traced, from the first error of a chain.
 
-
-def _cause(error: BaseException) -> str:
-    """Return the message of the first error in a chain, on one line and without colours."""
+    It is the message of an error of this framework, or else names the innermost part of the model.
+    """
     while error.__cause__ is not None:
         error = error.__cause__
+    if isinstance(error, UserError):
+        return str(error)
+    parts = [frame.f_locals.get("self") for frame, _ in traceback.walk_tb(error.__traceback__)]
+    own = [
+        part
+        for part in parts
+        if isinstance(part, nn.Module) and not type(part).__module__.startswith("torch.")
+    ]
+    name = type(own[-1]).__name__ if own and not isinstance(own[-1], Traced) else "density"
     lines = [line.strip() for line in str(error).replace("\x1b[96m", "").replace("\x1b[0m", "").splitlines()]
-    return next((line for line in lines if line), type(error).__name__)
-
-
-def open_session(file: Path) -> Any:
-    """Return a session of ONNX Runtime on one thread."""
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    return onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+    cause = next((line for line in lines if line), type(error).__name__)
+    return (
+        f"Its part {name} is no sequence of operations that torch.export can follow ({shorten(cause, 120)})."
+    )
 
 
 @torch.no_grad()
 def _compare(
-    model: Exporting, session: Any, layout: Mapping[str, Any], names: list[str], modules: list[str]
+    model: Exporting, session: Session, noises: Sequence[ModelNoise], form: Exported, names: list[str]
 ) -> dict[str, dict[str, float]]:
     """Return the largest differences between the exported and the original model.
+
+    Log-densities of a family that replaces an estimate (`Exported.remark`) are not compared.
 
     Raises:
         ConfigError: a difference is above its limit.
     """
     families = {
-        key: family for name in modules for key, family in importlib.import_module(name).FAMILIES.items()
+        key: family
+        for name in set(form.modules())
+        for key, family in importlib.import_module(name).FAMILIES.items()
     }
+    layout, estimated = form.layout(), any(form.remarks())
     report: dict[str, dict[str, float]] = {}
     for label, spread in EXTREMES.items():
         parameters = densities = 0.0
         for count in (1, BATCH):
-            arrays = model.arrays(count, spread, seed=count)
-            density = model.density(arrays)
-            outputs = dict(zip(names, session.run(names, {"input": arrays.numpy()}), strict=True))
-            own = {name: tensor.numpy() for name, tensor in exported(density).tensors()}
+            arrays = model.accepted_arrays(count, spread)
+            numbers = [noise.draw(count, number) for number, noise in enumerate(noises)]
+            outputs = dict(zip(names, session.run(names, feed(arrays, noises, numbers)), strict=True))
+            with given_draws(numbers):
+                density = model.density(arrays)
+                own = {name: tensor.numpy() for name, tensor in exported(density).tensors()}
             parameters = max([parameters, *(_difference(outputs[name], own[name]) for name in names)])
+            if estimated:
+                continue
             torch.manual_seed(0)
             values = density.sample(torch.Size((7,)))
             expected = density.log_prob(values).double().numpy()
@@ -304,15 +452,21 @@ def _compare(
             finite = np.isfinite(expected)
             away = np.abs(computed - expected)[finite] / np.maximum(1, np.abs(expected[finite]))
             densities = max(densities, float(away.max(initial=0)))
-        report[label] = {"parameters": parameters, "log_density": densities}
+        report[label] = {"parameters": parameters} | ({} if estimated else {"log_density": densities})
         # extreme densities have log-densities that float32 itself does not resolve
         if not (parameters <= PARITY and (densities <= DENSITY_PARITY or spread > 1)):
             raise _refusal(
                 model,
-                f"The exported network differs from it by {parameters:.1e} ({PARITY:g} is allowed) in the parameters "
-                f"and by {densities:.1e} ({DENSITY_PARITY:g}) in log-densities, for {label} inputs.",
+                f"The exported network differs from it by {parameters:.1e} ({PARITY:g} is allowed) in the "
+                f"parameters and by {densities:.1e} ({DENSITY_PARITY:g}) in log-densities, for {label} inputs.",
             )
     return report
+
+
+def feed(arrays: Tensor, noises: Sequence[ModelNoise], numbers: Sequence[Tensor]) -> dict[str, np.ndarray]:
+    """Return the inputs of an exported model by name."""
+    used = {noise.name: tensor.numpy() for noise, tensor in zip(noises, numbers, strict=True) if noise.name}
+    return {"input": arrays.numpy(), **used}
 
 
 def _difference(computed: np.ndarray, expected: np.ndarray) -> float:
@@ -345,9 +499,9 @@ def _write_code(modules: list[str], folder: Path) -> list[str]:
     return list(names.values())
 
 
-def _input_entry(model: Exporting) -> dict[str, Any]:
+def _input_entry(model: Exporting, shape: Sequence[int | str]) -> dict[str, Any]:
     entry: dict[str, Any] = {
-        "shape": ["batch", *model.description.input_shape],
+        "shape": ["batch", *shape],
         "dtype": str(model.dtype).removeprefix("torch."),
     }
     if model.description.columns:
@@ -362,7 +516,7 @@ def target_entry(target: Target) -> dict[str, Any]:
 
 
 @torch.no_grad()
-def _latency(model: Exporting, session: Any) -> dict[str, dict[str, float]]:
+def _latency(model: Exporting, session: Session, noises: Sequence[ModelNoise]) -> dict[str, dict[str, float]]:
     """Return processor milliseconds of a batch, by batch size and form of the model, on one thread."""
     frozen = freeze_predictor(model.predictor, model.description.input_shape)
     threads = torch.get_num_threads()
@@ -372,11 +526,11 @@ def _latency(model: Exporting, session: Any) -> dict[str, dict[str, float]]:
         for count in (1, 64):
             arrays = model.arrays(count, 1.0)
             inputs = model.inputs(arrays)
-            array = arrays.numpy()
+            inputs_by_name = feed(arrays, noises, [noise.draw(count, 0) for noise in noises])
             forms: dict[str, Callable[[], object]] = {
                 "torch": lambda inputs=inputs: model.predictor(inputs),
                 "frozen": lambda inputs=inputs: frozen.density(inputs),
-                "onnxruntime": lambda array=array: session.run(None, {"input": array}),
+                "onnxruntime": lambda inputs_by_name=inputs_by_name: session.run(None, inputs_by_name),
             }
             times[str(count)] = {name: round(_milliseconds(call), 4) for name, call in forms.items()}
         return times

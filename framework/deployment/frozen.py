@@ -2,8 +2,9 @@
 
 The computation from features to raw parameters is read from the model's graph (torch.export), so no encoder has to
 declare its layers. If the graph contains fully connected layers only, batch norm is folded into the weights of the
-neighbouring layers, and dropout is removed. One compiled function then computes the raw parameters of one sample;
-torch computes those of several samples. Any other model is run by torch unchanged, without gradients.
+neighbouring layers, and dropout is removed. One compiled function then computes the raw parameters of one sample, and
+ONNX Runtime or torch's matrix products those of more. The networks of any other model are computed by ONNX Runtime if
+the extra `export` is installed, and by torch otherwise; the density is computed by torch.
 """
 
 import copy
@@ -20,6 +21,7 @@ from torch.distributions import Distribution
 from framework.configuration.loading import load_with_description, reader, user_batch
 from framework.data import Data, Frame
 from framework.deployment.frozen_network import Layer, Network, read_network, to_probabilities
+from framework.deployment.onnx_networks import use_onnx
 from framework.distributions.affine import AffineDensity
 from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.description import CategoricalDensity
@@ -67,8 +69,9 @@ def freeze_predictor(predictor: Predictor, input_shape: Sequence[int] | None = N
 class Frozen:
     """Deployable form of a predictor: a function from inputs to predictions.
 
-    Its predictions have the data type of the predictor's parameters, and differ by at most 1e-6 from those of the
-    predictor.
+    Its predictions have the data type of the predictor's parameters. The probabilities of fully connected classifiers
+    differ by at most 1e-6 from those of the predictor. Raw parameters that ONNX Runtime computes differ by at most 1e-5
+    times the largest one, or by 1e-5 if it is below 1; a network that differs more is run by torch.
 
     Attributes:
         form: sentence that describes how the predictions are computed.
@@ -169,22 +172,26 @@ class Frozen:
         return self.inner.head(raw)
 
     def _read(self, shape: tuple[int, ...]) -> None:
-        """Set `form`, and set `network` if all layers of the model are fully connected.
+        """Set `form`; set `network` if all layers of the model are fully connected, else let ONNX Runtime compute them.
 
         Args:
             shape: shape of the features of one sample.
         """
-        if not isinstance(self.inner, Model):
-            self.form = f"{type(self.inner).__name__} in torch, without gradient"
-            return
-        network = read_network(self.inner, shape)
+        network = read_network(self.inner, shape) if isinstance(self.inner, Model) else None
         if network is None:
+            # images are bytes
+            dtype = torch.uint8 if len(shape) == 3 and self.front_end is None else self.dtype
+            count = use_onnx(self.inner, shape, dtype)
+            name = type(self.inner.head if isinstance(self.inner, Model) else self.inner).__name__
             self.form = (
-                "the model in torch, without gradient, because it has other layers than fully connected ones"
+                f"{count} network{'s' * (count > 1)} in ONNX Runtime, then {name} in torch"
+                if count
+                else f"{type(self.inner).__name__} in torch, without gradient"
             )
             return
         self.network = network
         layers = sum(isinstance(step, Layer) for step in network.steps)
+        assert isinstance(self.inner, Model)
         after = "softmax" if network.classes else f"{type(self.inner.head).__name__} in torch"
         self.form = f"{layers} fully connected layers with batch norm folded, compiled, then {after}"
 

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.fx import Node
 
 from framework.density_head import DensityHead, Fitted
+from framework.deployment.onnx_programs import Session, can_run_onnx
 from framework.model import Model
 from framework.storage.kernels import compiler, kernel_cache
 
@@ -76,8 +77,8 @@ class Network:
     The intermediate results are called registers and numbered. Register 0 has the features, (batch, length). Each step
     reads registers of earlier numbers, and its output is the next register.
 
-    For one sample the layers are compiled functions. For two or more, torch is faster, because it reads the weights
-    once for all of them (benchmarks/framework/frozen.md).
+    For one sample the layers are compiled functions. For two or more, ONNX Runtime is faster, and torch where it is not
+    installed, because they read the weights once for all of them (benchmarks/framework/frozen.md).
 
     Attributes:
         steps: the steps, in order.
@@ -90,6 +91,8 @@ class Network:
     result: int
     dtype: np.dtype
     classes: bool = False
+    session: Session | None = None
+    cast_to_type: bool = False
 
     def __call__(self, features: np.ndarray) -> np.ndarray:
         """Return the raw parameters, or the class logits, for features."""
@@ -98,6 +101,8 @@ class Network:
             for step in self.steps:
                 arrays.append(step.of_one(arrays))
             return arrays[self.result]
+        if len(features) > 1 and (session := self._session_of_batches()) is not None:
+            return session.run(None, {"features": features})[0]
         with torch.inference_mode():
             # torch requires writable memory
             tensors = [torch.from_numpy(features if features.flags.writeable else features.copy())]
@@ -105,9 +110,41 @@ class Network:
                 tensors.append(step.of_batch(tensors))
             return tensors[self.result].numpy()
 
+    def _session_of_batches(self) -> Session | None:
+        """Return the session of ONNX Runtime that computes batches; None if it is not installed."""
+        if self.session is None and self.cast_to_type and self.steps and can_run_onnx():
+            self.session = Session(self._onnx(), torch.get_num_threads())
+        return self.session
+
+    def _onnx(self) -> bytes:
+        """Return the network as the content of an ONNX file."""
+        from onnx import TensorProto, helper, numpy_helper
+
+        kind = TensorProto.DOUBLE if self.dtype == np.float64 else TensorProto.FLOAT
+        names, nodes, numbers = ["features"], [], []
+        for number, step in enumerate(self.steps, 1):
+            name = f"register{number}"
+            if isinstance(step, Concatenation):
+                sources = [names[source] for source in step.sources]
+                nodes.append(helper.make_node("Concat", sources, [name], axis=1))
+            else:
+                parts = {f"weight{number}": step.weight, f"bias{number}": step.bias}
+                numbers += [numpy_helper.from_array(array, key) for key, array in parts.items()]
+                affine = f"affine{number}" if step.rectified else name
+                nodes.append(helper.make_node("Gemm", [names[step.source], *parts], [affine]))
+                if step.rectified:
+                    nodes.append(helper.make_node("Relu", [affine], [name]))
+            names.append(name)
+        inputs = [helper.make_tensor_value_info("features", kind, ["batch", None])]
+        outputs = [helper.make_tensor_value_info(names[self.result], kind, ["batch", None])]
+        graph = helper.make_graph(nodes, "network", inputs, outputs, numbers)
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+        content: bytes = model.SerializeToString()
+        return content
+
     def cast(self, dtype: np.dtype) -> None:
         """Convert weights and biases to the type in which the network computes."""
-        self.dtype = dtype
+        self.dtype, self.cast_to_type = dtype, True
         for step in self.steps:
             if isinstance(step, Layer):
                 # clones of torch begin at cache lines, which the products read faster

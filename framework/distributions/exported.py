@@ -1,7 +1,7 @@
 """A density as named tensors, from which code without torch computes it; `mode=export` writes them."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import singledispatch
 from typing import Any
 
@@ -30,6 +30,7 @@ class Exported:
         parts: constructor arguments that are densities themselves, or lists of densities.
         settings: constructor arguments that are the same for every input, as plain values.
         code: import path of a module that computes the family with NumPy alone.
+        remark: sentence for the user if log-densities differ from those of the original density, which is an estimate.
     """
 
     family: str
@@ -37,6 +38,7 @@ class Exported:
     parts: Mapping[str, "Exported | list[Exported]"] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     code: str = NUMPY
+    remark: str = ""
 
     def map_tensors(self, change: Callable[[Tensor], Tensor]) -> "Exported":
         """Return the same density with `change` applied to each tensor."""
@@ -47,7 +49,7 @@ class Exported:
             for key, part in self.parts.items()
         }
         parameters = {key: change(value) for key, value in self.parameters.items()}
-        return Exported(self.family, parameters, parts, self.settings, self.code)
+        return replace(self, parameters=parameters, parts=parts)
 
     def tensors(self, path: str = "") -> Iterator[tuple[str, Tensor]]:
         """Yield every tensor with its path, such as "components.location"."""
@@ -78,6 +80,13 @@ class Exported:
         yield self.code
         for _, part in self._named_parts(""):
             yield from part.modules()
+
+    def remarks(self) -> Iterator[str]:
+        """Yield the remarks of the density and of its parts."""
+        if self.remark:
+            yield self.remark
+        for _, part in self._named_parts(""):
+            yield from part.remarks()
 
     def _named_parts(self, path: str) -> Iterator[tuple[str, "Exported"]]:
         for key, part in self.parts.items():

@@ -8,8 +8,10 @@ This module and the modules of families import only NumPy and Python's own libra
 where nothing else is installed.
 """
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
+from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,10 +20,15 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 DRAWS = 4096
-"""Number of draws of an estimated entropy; it is printed with its standard error."""
+"""Number of draws of an estimated entropy, which is printed with its standard error, and of estimated medians."""
+MANY = 16
+"""Number of peaks above which neighbouring ones share panels of a quadrature, and only the highest are compared."""
 STEPS = 200
 """Largest number of steps of the search for a mode and of a bisection."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
+_CIRCLE_NODES, _CIRCLE_WEIGHTS = np.polynomial.legendre.leggauss(96)
+_LEAST = 40.0
+"""Value of κ (1 - cos θ) beyond which exp(κ (cos θ - 1)) is below 1e-17."""
 
 
 class Value(NamedTuple):
@@ -60,12 +67,24 @@ class Density:
         circular: whether the target consists of angles.
         reach: distance from a peak, in widths of the peak, up to which the density of one number is integrated; larger
             for heavy tails.
+        by_draws: whether medians and intervals are those of DRAWS draws, because the densities of single angles are not
+            known.
     """
 
     batch: tuple[int, ...]
     event: tuple[int, ...]
     circular: bool = False
     reach: float = 40.0
+    by_draws: bool = False
+
+    @property
+    def probabilities(self) -> Array:
+        """Probability of each class, (*batch, class).
+
+        Raises:
+            ValueError: the target is no class.
+        """
+        raise ValueError("Only classes have probabilities. Use `log_prob`.")
 
     def log_prob(self, value: Array) -> Array:
         """Return the log-density at `value` (*sample, *batch, *event), (*sample, *batch), nats."""
@@ -120,11 +139,30 @@ class Density:
 
     def bound(self, value: Array) -> Bound:
         """Return a lower bound of the log-density that touches it at `value` (*sample, *batch, *event)."""
-        raise ValueError("No lower bound of this density is known.")
+        raise ValueError("The mode of a mixture of these densities is not known. Use the median.")
 
     def starts(self) -> Array:
         """Return values at which the search for the mode of a mixture starts, (start, *batch, *event)."""
         return self.mode()[None]
+
+    def pick(self, index: Array, axis: int) -> "Density":
+        """Return densities chosen along a batch dimension; `index` replaces it and has the dimensions before it.
+
+        Args:
+            index: (*batch up to the dimension `axis`, count).
+            axis: number of the batch dimension.
+        """
+        chosen = copy.copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, Density):
+                setattr(chosen, name, value.pick(index, axis))
+            elif isinstance(value, list):
+                setattr(chosen, name, [part.pick(index, axis) for part in value])
+            elif isinstance(value, np.ndarray) and value.shape[: axis + 1] == self.batch[: axis + 1]:
+                wide = index.reshape(*index.shape, *(1,) * (value.ndim - axis - 1))
+                setattr(chosen, name, np.take_along_axis(value, wide, axis))
+        chosen.batch = (*index.shape, *self.batch[axis + 1 :])
+        return chosen
 
     def parts(self) -> list[Any] | None:
         """Return the labels or intervals of the prediction set of each item of the batch; None without such sets."""
@@ -133,20 +171,9 @@ class Density:
     def nodes(self) -> tuple[Array, Array]:
         """Return quadrature points of one number, and the probability that each represents, both (point, *batch).
 
-        The line is cut at each peak and at distances from it that grow by a constant factor. Gauss's rule gives the
-        points between two neighbouring cuts.
+        The points are those of Gauss's rule between the `edges`.
         """
-        place, width = self.peaks()
-        steps = np.concatenate(
-            [[0.0], np.geomspace(0.5, self.reach, math.ceil(4.9 * math.log10(self.reach)))]
-        )
-        steps = np.concatenate([-steps[:0:-1], steps])
-        edges = (place + width * steps.reshape(-1, *(1,) * place.ndim)).reshape(-1, *self.batch)
-        if self.circular:
-            first = place[:1]
-            edges = np.concatenate([first - math.pi + np.mod(edges - first + math.pi, 2 * math.pi)])
-            edges = np.concatenate([first - math.pi, edges, first + math.pi])
-        edges = np.sort(edges, 0)
+        edges = self.edges()
         half = np.diff(edges, axis=0)[:, None] / 2
         shape = (1, -1, *(1,) * len(self.batch))
         points = edges[:-1, None] + half * (1 + _NODES.reshape(shape))
@@ -154,12 +181,35 @@ class Density:
         points, weights = (part.reshape(-1, *self.batch) for part in (points, weights))
         return points, weights * np.exp(self.log_prob(points[..., None]))
 
+    def edges(self) -> Array:
+        """Return the ends of the panels of a quadrature of one number, ascending, (edge, *batch).
+
+        The ends are at distances from the peaks that grow by a constant factor; those of angles span the circle. The
+        distances from many peaks are rounded, so that few panels remain where peaks overlap.
+        """
+        place, width = self.peaks()
+        steps = np.concatenate(
+            [[0.0], np.geomspace(0.5, self.reach, math.ceil(4.9 * math.log10(self.reach)))]
+        )
+        steps = np.concatenate([-steps[:0:-1], steps]).reshape(-1, *(1,) * place.ndim)
+        edges = (place + width * steps).reshape(-1, *self.batch)
+        if len(place) > MANY:
+            gaps = width * np.maximum(0.5, np.abs(steps) / 2)
+            edges = merge(wrap(edges) if self.circular else edges, gaps.reshape(edges.shape))
+        if self.circular:
+            first = place[:1]
+            edges = first - math.pi + np.mod(edges - first + math.pi, 2 * math.pi)
+            edges = np.concatenate([first - math.pi, edges, first + math.pi])
+        return np.sort(edges, 0)
+
     def median(self) -> Array:
         """Return the point of least expected absolute deviation, number by number, (*batch, *event)."""
         if not self.event:
             return self.mode()
+        if self.by_draws:
+            return self._central_of_draws(0.0)[0]
         parts = [self.marginal(index) for index in range(self.event[0])]
-        find = _circular_median if self.circular else lambda part: _quantile(part, 0.5)
+        find = _circular_median if self.circular else lambda part: _quantiles(part, 0.5)[0]
         return np.stack([find(part) for part in parts], -1)
 
     def interval(self, mass: float) -> Interval:
@@ -167,29 +217,130 @@ class Density:
 
         For angles, `low` is in [-π, π), and the median splits the arc into two parts of equal probability.
         """
+        if self.by_draws:
+            return Interval(*self._central_of_draws(mass)[1:])
         parts = [self.marginal(index) for index in range(self.event[0])]
         find = _arc if self.circular else _central
         ends = [find(part, mass) for part in parts]
         return Interval(*(np.stack(side, -1) for side in zip(*ends, strict=True)))
 
+    def _central_of_draws(self, mass: float) -> tuple[Array, Array, Array]:
+        """Return the medians of DRAWS draws and the ends of their central arcs, (*batch, angle) each."""
+        draws = np.sort(self.sample(np.random.default_rng(0), DRAWS).reshape(DRAWS, -1), 0)
+        results = [_arc_of_draws(column, mass) for column in draws.T]
+        median, low, high = (
+            np.reshape(numbers, (*self.batch, *self.event)) for numbers in zip(*results, strict=True)
+        )
+        return median, low, high
 
-def _quantile(density: Density, probability: float) -> Array:
-    """Return the quantile of one real number at `probability`, (*batch), by bisection."""
+
+def merge(places: Array, resolution: Array) -> Array:
+    """Return the different places after each was rounded to a multiple of a power of two, at most its resolution.
+
+    Args:
+        places: (place, *batch).
+        resolution: largest rounding step of each place, of the same shape.
+
+    Returns:
+        Ascending places, (place, *batch); items with fewer places than others repeat their last one.
+    """
+    step = np.exp2(np.floor(np.log2(resolution)))
+    rounded = np.sort((np.round(places / step) * step).reshape(len(places), -1), 0)
+    new = np.ones(rounded.shape, bool)
+    new[1:] = rounded[1:] != rounded[:-1]
+    order = np.argsort(~new, axis=0, kind="stable")[: int(new.sum(0).max(initial=1))]
+    places_once = np.where(
+        np.take_along_axis(new, order, 0), np.take_along_axis(rounded, order, 0), rounded[-1:]
+    )
+    return places_once.reshape(-1, *places.shape[1:])
+
+
+def _arc_of_draws(angles: Array, mass: float) -> tuple[float, float, float]:
+    """Return the median of ascending angles, and the ends of the central arc around it that holds the share `mass`."""
+    count = len(angles)
+    turn = np.concatenate([angles, angles + 2 * math.pi])
+    total = np.concatenate([[0.0], np.cumsum(turn)])
+    first = np.arange(count)
+    middle = np.searchsorted(turn, angles + math.pi)
+    ahead = total[middle] - total[first] - (middle - first) * angles
+    behind = (first + count - middle) * (angles + 2 * math.pi) - (total[first + count] - total[middle])
+    median = float(angles[(ahead + behind).argmin()])
+    away = np.sort(wrap(angles - median))
+    below, above = away[away < 0][::-1], away[away >= 0]
+    ends = []
+    for side, sign in ((below, -1), (above, 1)):
+        rank = math.ceil(mass / 2 * count) - 1
+        ends.append(0.0 if rank < 0 else float(side[rank]) if rank < len(side) else sign * math.pi)
+    low = float(wrap(np.array(median + ends[0])))
+    return median, low, low + ends[1] - ends[0]
+
+
+class Cumulative:
+    """The distribution function of a density of one number, by quadrature between the edges of its panels.
+
+    It takes less time than the distribution functions of many components.
+
+    Args:
+        density: the density, with event (1,).
+    """
+
+    def __init__(self, density: Density) -> None:
+        self.density = density
+        edges = density.edges()
+        mass = density.nodes()[1].reshape(len(edges) - 1, len(_NODES), -1).sum(1)
+        self.edges = edges.reshape(len(edges), -1)
+        self.mass = np.concatenate([np.zeros_like(mass[:1]), np.cumsum(mass, 0)])
+
+    def below(self, value: Array) -> Array:
+        """Return the probability between the first edge and `value` (*sample, *batch), (*sample, *batch)."""
+        shape = np.broadcast_shapes(value.shape, self.density.batch)
+        flat = np.broadcast_to(value, shape).reshape(-1, self.edges.shape[1])
+        panel = (flat >= self.edges[1:-1, None]).sum(0)
+        start = np.take_along_axis(self.edges, panel, 0)
+        half = np.clip(flat - start, 0, np.take_along_axis(self.edges, panel + 1, 0) - start) / 2
+        points = start + half * (1 + _NODES[:, None, None])
+        log_prob = self.density.log_prob(points.reshape(len(_NODES), *shape, 1)).reshape(points.shape)
+        part = (half * _WEIGHTS[:, None, None] * np.exp(log_prob)).sum(0)
+        return np.clip(np.take_along_axis(self.mass, panel, 0) + part, 0, 1).reshape(shape)
+
+    def arc(self, start: Array, end: Array) -> Array:
+        """Return the probability of an arc, as `Density.arc`."""
+        first = self.edges[0].reshape(self.density.batch)
+        low, high = (np.mod(side - first, 2 * math.pi) for side in (start, end))
+        inside = self.below(first + high) - self.below(first + low)
+        return np.clip(inside + (high < low), 0, 1)
+
+
+def _quantiles(density: Density, *probabilities: float) -> Array:
+    """Return quantiles of one real number, (probability, *batch), by Newton's method within shrinking brackets."""
+    wanted = np.reshape(probabilities, (-1, *(1,) * len(density.batch)))
     place, width = density.peaks()
-    low, high = (place - width).min(0), (place + width).max(0)
-    reach = high - low
+    ends = []
+    for side, end in ((-1, (place - width).min(0)), (1, (place + width).max(0))):
+        end = np.broadcast_to(end, (len(probabilities), *density.batch))
+        reach = np.broadcast_to((place + width).max(0) - (place - width).min(0), end.shape)
+        for _ in range(STEPS):
+            inside = side * (density.cdf(end[..., None]) - wanted) < 0
+            if not inside.any():
+                break
+            end, reach = np.where(inside, end + side * reach, end), 2 * reach
+        ends.append(end)
+    low, high = ends
+    value, before = low + (high - low) / 2, high - low
     for _ in range(STEPS):
-        outside = density.cdf(low[..., None]) > probability
-        if not outside.any():
+        excess = density.cdf(value[..., None]) - wanted
+        low, high = np.where(excess < 0, value, low), np.where(excess < 0, high, value)
+        with np.errstate(all="ignore"):
+            step = -excess / np.exp(density.log_prob(value[..., None]))
+        # the bracket is halved where Newton's method leaves it or is slow
+        newton = (value + step > low) & (value + step < high) & (np.abs(step) < before / 2)
+        new = np.where(newton, value + step, low + (high - low) / 2)
+        finished = (np.abs(excess) <= 4e-16) | (np.abs(new - value) <= 4e-16 * np.abs(value))
+        before = np.abs(new - value)
+        value = np.where(excess == 0, value, new)
+        if finished.all():
             break
-        low, reach = np.where(outside, low - reach, low), 2 * reach
-    reach = high - low
-    for _ in range(STEPS):
-        outside = density.cdf(high[..., None]) < probability
-        if not outside.any():
-            break
-        high, reach = np.where(outside, high + reach, high), 2 * reach
-    return _bisect(lambda middle: density.cdf(middle[..., None]) < probability, low, high)
+    return value
 
 
 def _bisect(below: Any, low: Array, high: Array) -> Array:
@@ -204,8 +355,9 @@ def _bisect(below: Any, low: Array, high: Array) -> Array:
 
 
 def _central(density: Density, mass: float) -> tuple[Array, Array]:
-    """Return the ends of the central interval of probability `mass` of one real number, (*batch) each."""
-    return _quantile(density, (1 - mass) / 2), _quantile(density, (1 + mass) / 2)
+    """Return the ends of the central interval of one real number, (*batch)."""
+    low, high = _quantiles(density, (1 - mass) / 2, (1 + mass) / 2)
+    return low, high
 
 
 def _circular_median(density: Density) -> Array:
@@ -219,6 +371,8 @@ def _circular_median(density: Density) -> Array:
     near = (place + width * np.array([-4, -1, 0, 1, 4]).reshape(-1, *(1,) * place.ndim)).reshape(
         -1, *density.batch
     )
+    if len(place) > MANY:
+        near = merge(wrap(near), np.broadcast_to(width, (5, *width.shape)).reshape(near.shape))
     edges = np.sort(wrap(np.concatenate([grid, near, wrap(near + math.pi)])), 0)
     edges = np.concatenate([edges, edges[:1] + 2 * math.pi])
 
@@ -253,6 +407,25 @@ def wrap(angle: Array) -> Array:
     return np.mod(np.asarray(angle) + math.pi, 2 * math.pi) - math.pi
 
 
+def half_circle_rule(concentration: Array, angle: Array) -> tuple[Array, Array]:
+    """Return points and weights of Gauss's rule for exp(κ (cos θ - 1)) from 0 to `angle`, or to where it ends."""
+    sine = np.sqrt(_LEAST / 2 / np.maximum(concentration, _LEAST / 2))  # κ (1 - cos θ) = 2 κ sin²(θ/2)
+    end = np.minimum(angle, 2 * np.arcsin(sine))
+    shape = (-1, *(1,) * np.ndim(end))
+    return end / 2 * (1 + _CIRCLE_NODES.reshape(shape)), end / 2 * _CIRCLE_WEIGHTS.reshape(shape)
+
+
+def half_circle(concentration: Array, angle: Array) -> Array:
+    """Return ∫ exp(κ (cos θ - 1)) dθ from 0 to `angle` in [0, π]."""
+    points, weights = half_circle_rule(concentration, angle)
+    return (weights * np.exp(-2 * concentration * np.sin(points / 2) ** 2)).sum(0)
+
+
+def bessel_i0e(value: Array) -> Array:
+    """Return the modified Bessel function I₀(x) exp(-x) for x ≥ 0."""
+    return half_circle(value, np.full_like(value, math.pi)) / math.pi
+
+
 def log_sum_exp(terms: Array) -> Array:
     """Return log Σ exp(terms) over the last dimension; -inf if all terms are."""
     largest = terms.max(-1, keepdims=True)
@@ -263,10 +436,11 @@ def log_sum_exp(terms: Array) -> Array:
 
 def normal_cdf(standard: Array) -> Array:
     """Return the distribution function of the standard normal density, with the digits of `math.erfc`."""
-    flat = np.asarray(standard, dtype=np.float64)
-    return np.fromiter(
-        (math.erfc(-x / math.sqrt(2)) / 2 for x in flat.ravel()), np.float64, flat.size
-    ).reshape(flat.shape)
+    argument = np.asarray(standard, dtype=np.float64) / -math.sqrt(2)
+    return np.asarray(_erfc(argument), dtype=np.float64) / 2
+
+
+_erfc = np.frompyfunc(math.erfc, 1, 1)
 
 
 class Categorical(Density):
@@ -348,6 +522,13 @@ class Normal(Density):
         value = (np.log(self.scale) + (1 + math.log(2 * math.pi)) / 2).sum(-1)
         return Value(value, np.zeros_like(value))
 
+    def median(self) -> Array:
+        return self.location
+
+    def interval(self, mass: float) -> Interval:
+        reach = NormalDist().inv_cdf((1 + mass) / 2) * self.deviation()
+        return Interval(self.location - reach, self.location + reach)
+
     def deviation(self) -> Array:
         """Return the standard deviation of each number, (*batch, number)."""
         if self.coefficients is None:
@@ -422,7 +603,9 @@ class Mixture(Density):
         self.log_weights = log_weights - log_sum_exp(log_weights)[..., None]
         self.components = components
         self.reach = components.reach
-        self.batch, self.event, self.circular = components.batch[:-1], components.event, components.circular
+        self._cumulative: Cumulative | None = None  # of this batch
+        self.batch, self.event = components.batch[:-1], components.event
+        self.circular, self.by_draws = components.circular, components.by_draws
 
     @property
     def _axis(self) -> int:
@@ -441,6 +624,9 @@ class Mixture(Density):
 
     def sample(self, generator: np.random.Generator, count: int) -> Array:
         chosen = Categorical(self.log_weights).sample(generator, count)
+        if self.log_weights.shape[-1] > MANY and not isinstance(self.components, Stacked):
+            picked = self.components.pick(np.moveaxis(chosen.astype(np.int64), 0, -1), len(self.batch))
+            return np.moveaxis(picked.sample(generator, 1)[0], len(self.batch), 0)
         draws = self.components.sample(generator, count)
         index = chosen.astype(np.int64).reshape(*chosen.shape, 1, *(1,) * len(self.event))
         shape = (*index.shape[: self._axis], 1, *self.event) if self.event else index.shape
@@ -456,6 +642,9 @@ class Mixture(Density):
         if self.log_weights.shape[-1] == 1:
             return self.components.mode().squeeze(self._axis)
         value = self.starts()
+        if len(value) > MANY:  # the highest ones
+            order = np.argsort(-self.log_prob(value), 0)[:MANY]
+            value = np.take_along_axis(value, order.reshape(*order.shape, *(1,) * len(self.event)), 0)
         for _ in range(STEPS):
             bound = self.bound(value)
             if self.circular:
@@ -476,6 +665,16 @@ class Mixture(Density):
         weights = np.exp(self.log_weights)[(..., *(None,) * len(self.event))]
         return (weights * self.components.mean()).sum(self._axis)
 
+    def median(self) -> Array:
+        if self.event and self.log_weights.shape[-1] == 1:
+            return self.components.median().squeeze(self._axis)
+        return super().median()
+
+    def interval(self, mass: float) -> Interval:
+        if self.log_weights.shape[-1] == 1:
+            return Interval(*(end.squeeze(self._axis) for end in self.components.interval(mass)))
+        return super().interval(mass)
+
     def entropy(self) -> Value:
         if not self.event:
             return Categorical(np.log(np.maximum(self.probabilities, 1e-300))).entropy()
@@ -486,10 +685,22 @@ class Mixture(Density):
     def marginal(self, index: int) -> "Mixture":
         return Mixture(self.log_weights, self.components.marginal(index))
 
+    def _many(self) -> Cumulative | None:
+        """Return the distribution function by quadrature if there are many components."""
+        if self.log_weights.shape[-1] <= MANY:
+            return None
+        if self._cumulative is None or self._cumulative.density is not self:
+            self._cumulative = Cumulative(self)
+        return self._cumulative
+
     def cdf(self, value: Array) -> Array:
+        if (many := self._many()) is not None:
+            return many.below(value[..., 0])
         return (np.exp(self.log_weights) * self.components.cdf(value[..., None, :])).sum(-1)
 
     def arc(self, start: Array, end: Array) -> Array:
+        if (many := self._many()) is not None:
+            return many.arc(start, end)
         return (np.exp(self.log_weights) * self.components.arc(start[..., None], end[..., None])).sum(-1)
 
     def peaks(self) -> tuple[Array, Array]:
@@ -513,6 +724,7 @@ class Stacked(Density):
         self.densities = densities
         self.reach = max(density.reach for density in densities)
         self.batch, self.event, self.circular = (*first.batch, len(densities)), first.event, first.circular
+        self.by_draws = any(density.by_draws for density in densities)
 
     @property
     def _axis(self) -> int:
@@ -601,6 +813,12 @@ class Affine(Density):
 
     def mean(self) -> Array:
         return self.location + self.scale * self.inner.mean()
+
+    def median(self) -> Array:
+        return self.location + self.scale * self.inner.median()
+
+    def interval(self, mass: float) -> Interval:
+        return Interval(*(self.location + self.scale * end for end in self.inner.interval(mass)))
 
     def entropy(self) -> Value:
         inner = self.inner.entropy()

@@ -76,19 +76,21 @@ def sizes(clouds: Tensor) -> Int[Tensor, "batch"]:
             "`data`."
         )
     count, points, _ = clouds.shape
+    if (
+        torch.compiler.is_exporting()
+    ):  # a trace depends on no value; an exported model's script checks its clouds
+        return _rows_to_last_point(clouds)
     # a finite sum has only finite summands, so that one pass suffices for clouds without padding
     if points and math.isfinite(float(clouds.detach().sum())):
         return torch.full((count,), points, device=clouds.device)
-    number = torch.arange(1, points + 1, device=clouds.device)
-    padding = clouds.isnan().all(-1)
-    counts = number.new_zeros(count) if points == 0 else number.where(~padding, 0).amax(1)
+    counts = clouds.new_zeros(count, dtype=torch.int64) if points == 0 else _rows_to_last_point(clouds)
     empty = (counts == 0).nonzero()
     if len(empty):
         raise DataError(
             f"Cloud {int(empty[0])} of the batch has no point (rows of NaN are padding); expected at least "
             "one. Leave out empty files."
         )
-    bad = ~clouds.isfinite().all(-1) & (number <= counts[:, None])
+    bad = ~clouds.isfinite().all(-1) & point_mask(clouds, counts)
     if bad.any():
         cloud, point = bad.nonzero()[0].tolist()
         column = int((~clouds[cloud, point].isfinite()).nonzero()[0])
@@ -98,6 +100,12 @@ def sizes(clouds: Tensor) -> Int[Tensor, "batch"]:
             "remove such points."
         )
     return counts
+
+
+def _rows_to_last_point(clouds: Float[Tensor, "batch points columns"]) -> Int[Tensor, "batch"]:
+    """Return the number of rows of each cloud up to the last row that is not padding."""
+    number = torch.arange(1, clouds.shape[1] + 1, device=clouds.device)
+    return number.where(~clouds.isnan().all(-1), 0).amax(1)
 
 
 def point_mask(clouds: Tensor, sizes: Tensor | None) -> Bool[Tensor, "batch points"]:
@@ -147,10 +155,13 @@ def normalise_clouds(
     """
     if counts is None:
         counts = sizes(clouds)
-    count = len(clouds)
-    if how == "none" or count == 0:
+    count = clouds.shape[0]
+    exporting = torch.compiler.is_exporting()  # a trace depends on no value and holds no compiled code
+    if how == "none" or (not exporting and count == 0):
         origin = torch.zeros(count, 3, dtype=torch.float64, device=clouds.device)
         return NormalisedClouds(clouds, origin, torch.ones_like(origin[:, 0]))
+    if exporting:
+        return _composed(clouds, how, counts)
     if how == "unit_ball" and clouds.device.type == "cpu":
         arrays = unit_ball_arrays(clouds.detach().contiguous().numpy(), counts.numpy())
         normalised = NormalisedClouds(*(torch.from_numpy(array).to(clouds.device) for array in arrays))
@@ -190,7 +201,7 @@ def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> NormalisedC
     """Return the normalised clouds, computed by differentiable tensor operations on any device."""
     _, points, columns = clouds.shape
     real = None  # mask of the rows that hold points; None if no cloud is padded
-    if not bool((counts == points).all()):
+    if torch.compiler.is_exporting() or not bool((counts == points).all()):
         real = point_mask(clouds, counts)[..., None]
     coordinates = clouds[..., :3].double()
     first = coordinates[:, :1]
@@ -231,10 +242,23 @@ def near_middle(
         real: mask of the rows that hold points; None if all do.
     """
     known = offset if real is None else offset.where(real, math.nan)
-    distance = torch.linalg.vector_norm(known - known.nanmedian(1, keepdim=True).values, dim=-1, keepdim=True)
-    typical = distance.nanmedian(1, keepdim=True).values
+    distance = torch.linalg.vector_norm(known - _lower_median(known), dim=-1, keepdim=True)
+    typical = _lower_median(distance)
     near = distance <= REACH * typical  # False for NaN
-    return near.where(typical > 0, ~distance.isnan())
+    typical_is_known = typical > 0
+    return (near & typical_is_known) | (~typical_is_known & ~distance.isnan())
+
+
+def _lower_median(
+    values: Float[Tensor, "batch points columns"],
+) -> Float[Tensor, "batch 1 columns"]:
+    """Return the median over the points, the lower one of two, without NaN."""
+    if not torch.compiler.is_exporting():
+        return values.nanmedian(1, keepdim=True).values
+    # ONNX has no such median
+    known = ~values.isnan()
+    ordered = values.where(known, math.inf).sort(1).values
+    return ordered.gather(1, (known.sum(1, keepdim=True) - 1) // 2)
 
 
 def denormalise_clouds(
@@ -262,6 +286,8 @@ def require_normalised(
         DataError: half of a cloud's points are farther than 2 · `reach` from the origin (fewer may be outliers that a
             robust normalisation left there), or all are nearer than 0.01 · `reach`, but not all at the origin.
     """
+    if torch.compiler.is_exporting():  # a trace depends on no value
+        return
     real = point_mask(coordinates, counts)
     norm = torch.linalg.vector_norm(coordinates.detach().double(), dim=-1)
     largest = norm.where(real, 0).amax(1) if norm.shape[1] else norm.sum(1)

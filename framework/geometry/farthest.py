@@ -5,6 +5,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from framework.errors import ConfigError
+
 
 @torch.no_grad()
 def farthest(
@@ -22,6 +24,10 @@ def farthest(
         counts: number of points of each cloud, at least 1; later rows are not read.
         count: number of points to choose.
     """
+    if torch.compiler.is_exporting():
+        raise ConfigError(
+            "The order of the farthest points is found step by step, for which ONNX has no operation."
+        )
     from framework.geometry.farthest_compiled import farthest as compiled
 
     coordinates = np.ascontiguousarray(positions.detach().cpu().double().numpy())

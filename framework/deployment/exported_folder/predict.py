@@ -28,6 +28,9 @@ from numpy.typing import NDArray
 
 from framework.distributions.numpy_densities import Density, build
 
+MOST_POINTS = 2**13
+"""Largest number of points that the network reads at once; more points do not fit into the caches."""
+
 
 class Model:
     """An exported model: a network in model.onnx, and the family of its densities in density.json.
@@ -54,19 +57,46 @@ class Model:
             self._families.update(importlib.import_module(name).FAMILIES)
         self._outputs: list[str] = self.description["outputs"]
         self._shape: list[int | str] = self.description["input"]["shape"]
+        self._cloud = "points" in self._shape
+        self._noise: list[dict[str, Any]] = self.description.get("noise", [])
+        self._random_of_seed: dict[int, list[NDArray[Any]]] = {}
         self._dtype = np.dtype(self.description["input"]["dtype"])
 
-    def __call__(self, inputs: Any) -> Density:
+    def __call__(self, inputs: Any, seed: int = 0) -> Density:
         """Return the densities for a batch of inputs.
+
+        Args:
+            inputs: an array as density.json describes it, batch dimension first; point clouds also as a list of arrays
+                of different lengths. Rows of NaN at the end of a cloud are padding.
+            seed: seed of the random numbers of a model that draws some. They are the same for all inputs, so that a
+                prediction does not depend on the other inputs.
 
         Raises:
             ValueError: the inputs have another shape than density.json says, or a number is not finite.
         """
-        return build(self.description["density"], self.parameters(inputs), self._families)
+        return build(self.description["density"], self.parameters(inputs, seed), self._families)
 
-    def parameters(self, inputs: Any) -> dict[str, NDArray[Any]]:
+    def parameters(self, inputs: Any, seed: int = 0) -> dict[str, NDArray[Any]]:
         """Return the parameters of the densities by name; arguments and errors are those of a call."""
-        array = np.asarray(inputs)
+        array = self._array(inputs)
+        at_once = max(1, MOST_POINTS // max(1, array.shape[1])) if self._cloud else max(1, len(array))
+        parts = [array[start : start + at_once] for start in range(0, len(array), at_once)] or [array]
+        runs = [
+            self._session.run(self._outputs, {"input": part} | self._random(len(part), seed))
+            for part in parts
+        ]
+        values: list[Any] = (
+            list(runs[0])
+            if len(runs) == 1
+            else [np.concatenate(outputs) for outputs in zip(*runs, strict=True)]
+        )
+        for value in values:
+            _require_finite(value, "distribution parameters")
+        return dict(zip(self._outputs, values, strict=True))
+
+    def _array(self, inputs: Any) -> NDArray[Any]:
+        """Return inputs as an array of the type and shape that the network reads, checked."""
+        array = padded(inputs) if self._cloud else np.asarray(inputs)
         if array.dtype.kind not in "buif":
             raise ValueError(
                 f"Got inputs of type {array.dtype}, but numbers are required. Give an array of numbers."
@@ -80,13 +110,30 @@ class Model:
             raise ValueError(
                 f"Got inputs of shape {array.shape}, but the model reads inputs of shape ({wanted})."
             )
+        if self._dtype == np.uint8 and array.dtype != np.uint8:
+            _require_bytes(array)
         with np.errstate(over="ignore"):
             array = np.ascontiguousarray(array, dtype=self._dtype)
-        _require_finite(array, "inputs")
-        values: list[Any] = list(self._session.run(self._outputs, {"input": array}))
-        for value in values:
-            _require_finite(value, "distribution parameters")
-        return dict(zip(self._outputs, values, strict=True))
+        if self._cloud:
+            _require_clouds(array)
+        else:
+            _require_finite(array, "inputs")
+        return array
+
+    def _random(self, count: int, seed: int) -> dict[str, NDArray[Any]]:
+        """Return the random numbers that the network reads for `count` inputs, by name."""
+        if not self._noise:
+            return {}
+        if seed not in self._random_of_seed:
+            generator = np.random.default_rng(seed)
+            self._random_of_seed = {seed: [_draw(entry, generator) for entry in self._noise]}
+        repeats = [
+            tuple(count if isinstance(size, str) else 1 for size in entry["shape"]) for entry in self._noise
+        ]
+        return {
+            entry["name"]: np.tile(numbers, repeat)
+            for entry, numbers, repeat in zip(self._noise, self._random_of_seed[seed], repeats, strict=True)
+        }
 
     def table(self, inputs: Any, interval: float | None = None) -> Iterator[dict[str, Any]]:
         """Yield a row for each input: point prediction, entropy, ends of the central interval, and prediction set.
@@ -101,9 +148,7 @@ class Model:
         entropy = density.entropy()
         ends = density.interval(interval) if interval is not None and len(density.event) == 1 else None
         if not density.event:
-            shares = np.exp(
-                np.stack([density.log_prob(np.full(density.batch, label)) for label in range(len(names))], -1)
-            )
+            shares = density.probabilities
         point = density.mode() if not density.event else density.median()
         sets = density.parts() if math.prod(density.event) == 1 else None
         unit = math.degrees(1) if target["kind"] == "angle" else 1.0
@@ -161,11 +206,68 @@ def read_csv(file: Path, columns: list[str]) -> NDArray[np.float64]:
     return np.array(rows, dtype=np.float64).reshape(-1, len(columns))
 
 
-def _require_finite(array: NDArray[Any], what: str) -> None:
+def padded(clouds: Any) -> NDArray[Any]:
+    """Return point clouds as one array (batch, points, column); smaller clouds end with rows of NaN.
+
+    Raises:
+        ValueError: the clouds have different numbers of columns, or are no arrays of numbers.
+    """
+    if isinstance(clouds, np.ndarray):
+        return clouds
+    try:
+        arrays = [np.asarray(cloud, dtype=np.float64) for cloud in clouds]
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError("A cloud is no array of numbers (point, column). Correct the input.") from None
+    if not arrays or any(array.ndim != 2 or array.shape[1:] != arrays[0].shape[1:] for array in arrays):
+        raise ValueError("Clouds must be arrays of numbers (point, column), all with the same columns.")
+    shape = (len(arrays), max(len(array) for array in arrays), arrays[0].shape[1])
+    result = np.full(shape, np.nan)
+    for row, array in zip(result, arrays, strict=True):
+        row[: len(array)] = array
+    return result
+
+
+def _draw(entry: Mapping[str, Any], generator: np.random.Generator) -> NDArray[Any]:
+    """Return the random numbers for one input."""
+    shape = [size if isinstance(size, int) else int(size.partition(" ")[0]) for size in entry["shape"]]
+    dtype = np.dtype(entry["dtype"])
+    if entry["kind"] == "uniform":
+        # rounding to float32 may give 1, which is no number of the interval
+        return np.minimum(generator.random(shape).astype(dtype), np.nextafter(dtype.type(1), dtype.type(0)))
+    return generator.standard_normal(shape).astype(dtype)
+
+
+def _require_clouds(array: NDArray[Any]) -> None:
+    """Raise an error that names the first cloud without points, or with a number that is not finite."""
+    with np.errstate(over="ignore"):
+        if np.isfinite(array.sum()) and array.shape[1]:
+            return
+    padding: Any = np.isnan(array).all(-1)
+    count = array.shape[1] - np.argmin(padding[:, ::-1], axis=1) if array.shape[1] else 0
+    empty = padding.all(1)
+    if empty.any():
+        raise ValueError(f"Cloud {int(empty.argmax())} has no point. Leave it out.")
+    bad: Any = ~np.isfinite(array).all(-1) & (np.arange(array.shape[1]) < np.reshape(count, (-1, 1)))
+    if bad.any():
+        row = int(np.argmax(bad.any(axis=1)))
+        raise ValueError(
+            f"Point {int(np.argmax(bad[row]))} of cloud {row} is not finite; rows of NaN are allowed at the end of a "
+            "cloud only. Correct the input."
+        )
+
+
+def _require_bytes(array: NDArray[Any]) -> None:
+    """Raise an error if numbers of an image are no integers from 0 to 255."""
+    with np.errstate(invalid="ignore"):
+        if not ((array >= 0) & (array <= 255) & (array == np.floor(array))).all():
+            raise ValueError("The pixels of images must be integers from 0 to 255.")
+
+
+def _require_finite(array: NDArray[Any], name: str) -> None:
     """Raise an error that names the first row with a number that is not finite."""
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         row = int((~np.isfinite(array.reshape(len(array), -1)).all(1)).argmax())
-        raise ValueError(f"The {what} of row {row} are not finite. Correct the input.")
+        raise ValueError(f"The {name} of row {row} are not finite. Correct the input.")
 
 
 def main(arguments: Mapping[str, Any] | None = None) -> None:

@@ -20,6 +20,8 @@ from framework.geometry.nearest.exponents import MOST
 
 OFTEN = 2**16
 """Largest number of queries that `processor.packed_well` packs in less than a second."""
+FEW_IN_TRACE, MOST_PARTS = 64, 16
+"""Number of queries that the search in a trace computes at a time, and largest number of parts of all queries."""
 
 
 class Nearest(NamedTuple):
@@ -101,6 +103,8 @@ def nearest(
             cloud.
     """
     clouds = clouds.detach()
+    if torch.compiler.is_exporting():
+        return nearest_in_trace(clouds, queries.points if isinstance(queries, Queries) else queries, sizes)
     own = isinstance(queries, Tensor) and queries.dim() == 3
     if isinstance(queries, Tensor) and not own:
         queries = prepare(queries, once=True)
@@ -126,6 +130,27 @@ def nearest(
     if clouds.device.type == "cpu":
         return on_processor(clouds, queries, sizes, query_sizes)
     return on_device(clouds, points, sizes, query_sizes)
+
+
+def nearest_in_trace(clouds: Tensor, queries: Tensor, sizes: Tensor | None) -> Nearest:
+    """Return what `nearest` returns, by operations of which every one has a form in ONNX.
+
+    The squared distance |x|² - 2 x·q + |q|² is computed in float64 as products of matrices, so that the distance of
+    points in the unit ball is exact to 1e-7. Few queries at a time keep the products in a CPU's cache.
+    """
+    points = clouds.double()
+    real = point_mask(clouds, sizes)
+    # a row of padding is far away from every query
+    square = points.square().sum(-1, keepdim=True).where(real[..., None], 1e300)
+    points = torch.cat([points.where(real[..., None], 0), square], -1)
+    factors = queries.double()
+    parts, indices = [], []
+    for some in factors.split(max(FEW_IN_TRACE, -(-factors.shape[0] // MOST_PARTS))):
+        squares = torch.cat([-2 * some, torch.ones_like(some[..., :1])], -1) @ points.mT
+        parts.append(squares.amin(-1))
+        indices.append(squares.argmin(-1))
+    distance = (torch.cat(parts, -1) + factors.square().sum(-1)).clamp(min=0).sqrt()
+    return Nearest(distance.to(clouds.dtype), torch.cat(indices, -1))
 
 
 def quick_distances(clouds: np.ndarray, queries: Queries) -> np.ndarray | None:

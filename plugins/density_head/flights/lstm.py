@@ -61,8 +61,8 @@ class LSTMHead(DensityHead):
             .clamp(-FARTHEST, FARTHEST)
         )
         frames = flat.unflatten(-1, (self.observed, len(PARTS)))
-        place, move = frames.new_zeros(len(flat), 3), frames.new_zeros(len(flat), 3)
-        begun = frames.new_zeros(len(flat), 1)
+        place, move = frames.new_zeros(flat.shape[0], 3), frames.new_zeros(flat.shape[0], 3)
+        begun = frames.new_zeros(flat.shape[0], 1)
         state = None
         for frame in frames.unbind(1):
             visible = (frame[:, 4:] > 0.5).to(frames.dtype)

@@ -47,4 +47,6 @@ class LatentDecoder(nn.Module):
         features, shared, turned = raw.split(self.parts, -1)
         spread = self.spread + turned.unflatten(-1, self.spread.shape)
         mixed = self.body(features + self.from_latent(z))
+        if torch.compiler.is_exporting():  # ONNX does not broadcast in such a sum
+            return mixed + shared + (spread * z.unsqueeze(-2)).sum(-1)
         return mixed + shared + torch.einsum("...nl,...l->...n", spread, z)

@@ -4,8 +4,11 @@
 """
 
 import copy
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -15,6 +18,7 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions.description import one_line
+from framework.distributions.exported import Exported, exported
 from framework.distributions.protocol import (
     Estimate,
     estimate,
@@ -99,10 +103,12 @@ class Latent(ABC):
     @property
     def items(self) -> int:
         """Number of items of the flattened batch."""
-        return self.center.shape[:-1].numel()
+        return math.prod(self.center.shape[:-1])
 
-    def full_precision(self) -> torch.autocast:
+    def full_precision(self) -> AbstractContextManager[Any]:
         """Return a context without autocast, so that networks are computed in full precision also in mixed training."""
+        if torch.compiler.is_exporting():  # without autocast already
+            return nullcontext()
         return torch.autocast(self.center.device.type, enabled=False)
 
     def points(self, effort: Effort, kept_count: int = 0) -> NormalPoints:
@@ -115,7 +121,7 @@ class Latent(ABC):
 
     def at_once(self, count: int) -> int:
         """Return how many of `count` samples z of an item are decoded together; all of them if a gradient is needed."""
-        if torch.is_grad_enabled():
+        if torch.is_grad_enabled() or torch.compiler.is_exporting():
             return max(1, count)
         return max(1, CHUNK // (max(1, self.items) * self.width))
 
@@ -228,6 +234,16 @@ for _function in (marginal, median, mode_candidates, peak_widths):
 @uniform.register
 def _(density: LatentDensity) -> Distribution:
     return uniform(density._example)
+
+
+@exported.register
+def _(density: LatentDensity) -> Exported:
+    """Return the mixture of the drawn components: log-densities of an exported model are those of this mixture."""
+    remark = (
+        f"Log-densities are those of a mixture of {density.effort.samples} components at random latent vectors from "
+        "the prior; the original model estimates them by importance sampling or to a tolerance."
+    )
+    return replace(exported(density.mixture), remark=remark)
 
 
 @tempered_density.register

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -16,6 +17,7 @@ from torch.distributions import Distribution
 
 from framework.distributions.closed_forms import normal_quantile
 from framework.distributions.density import Mixture, concatenate_estimates
+from framework.distributions.exported import Exported, exported
 from framework.distributions.protocol import Estimate, estimate, marginal, tempered_density
 from framework.distributions.shapes import broadcast_shapes
 from framework.distributions.tempering import tempered_classes
@@ -112,6 +114,12 @@ def _(density: SampledMixture, value: Tensor) -> Estimate:
 @marginal.register
 def _(density: SampledMixture, index: int) -> Distribution:
     return SampledMixture(density.log_weights, marginal(density.components, index), density.replicates)
+
+
+@exported.register
+def _(density: SampledMixture) -> Exported:
+    weights = {"log_weights": density.log_weights}
+    return Exported("mixture", weights, {"components": exported(density.components)})
 
 
 @tempered_density.register
@@ -293,7 +301,9 @@ class NormalPoints:
     ) -> None:
         self.shift = torch.rand(replicates, 1, items, dimensions, dtype=torch.float64, device=device)
         self.dtype = dtype
-        self.kept_count = kept_count if self.shift.numel() * kept_count <= LARGEST_KEPT else 0
+        # a trace depends on no size of a batch
+        few = not torch.compiler.is_exporting() and self.shift.numel() * kept_count <= LARGEST_KEPT
+        self.kept_count = kept_count if few else 0
 
     def __call__(
         self, items: Int[Tensor, "rows"], start: int, count: int
@@ -337,10 +347,11 @@ def lattice(
     of i at the binary point. The first 2^m points, for any m, are a complete lattice (Hickernell, Hong, L'Ecuyer &
     Lemieux 2000, §2).
     """
-    number = torch.arange(start, start + count, device=device)
-    inverse = torch.zeros(count, dtype=torch.float64, device=device)
+    # by NumPy, so that the points are constants in the trace of an exported model
+    number = np.arange(start, start + count)
+    inverse = np.zeros(count)
     for bit in range((start + count - 1).bit_length()):
         inverse += ((number >> bit) & 1) * 2.0 ** -(bit + 1)
     # below 2^20, so that products with numbers of up to 32 bits are exact
-    vector = [pow(GENERATOR, power, 2**20) for power in range(dimensions)]
-    return torch.remainder(inverse[:, None] * torch.tensor(vector, dtype=torch.float64, device=device), 1.0)
+    vector = np.array([pow(GENERATOR, power, 2**20) for power in range(dimensions)], dtype=np.float64)
+    return torch.from_numpy(np.remainder(inverse[:, None] * vector, 1.0)).to(device)

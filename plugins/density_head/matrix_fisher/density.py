@@ -11,6 +11,7 @@ from torch.distributions import Distribution, constraints
 
 from framework.distributions.circular import Circular, grid
 from framework.distributions.description import one_line
+from framework.distributions.exported import Exported, exported
 from framework.distributions.panels import entropy_of_one
 from framework.distributions.protocol import estimate, exact_estimate, marginal, pick, take, tempered_density
 from framework.distributions.uniform import uniform
@@ -174,6 +175,12 @@ estimate.register(Angle, exact_estimate)  # quadrature uses no random samples
 @marginal.register
 def _(density: MatrixFisher, index: int) -> Angle:
     return Angle(density, index)
+
+
+@exported.register
+def _(density: MatrixFisher) -> Exported:
+    code = "plugins.density_head.matrix_fisher.numpy_matrix_fisher"
+    return Exported("matrix_fisher", {"parameter": density.parameter}, code=code)
 
 
 @uniform.register

@@ -1,14 +1,19 @@
 """Von Mises densities of an exported model, computed with NumPy alone."""
 
 import math
+from functools import cached_property
 
 import numpy as np
 
-from framework.distributions.numpy_densities import Array, Bound, Density, Value, wrap
-
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(96)
-_LEAST = 40.0
-"""Value of κ (1 - cos θ) beyond which the density is below 1e-17 of its peak."""
+from framework.distributions.numpy_densities import (
+    Array,
+    Bound,
+    Density,
+    Value,
+    half_circle,
+    half_circle_rule,
+    wrap,
+)
 
 
 class VonMises(Density):
@@ -27,11 +32,12 @@ class VonMises(Density):
 
     def log_prob(self, value: Array) -> Array:
         half = np.sin((value - self.location) / 2)
-        return (-2 * self.concentration * half**2 - self._log_total()).sum(-1)
+        return (-2 * self.concentration * half**2 - self._log_total).sum(-1)
 
+    @cached_property
     def _log_total(self) -> Array:
         """Return log ∫ exp(κ (cos θ - 1)) dθ over the circle, (*batch, angle)."""
-        return np.log(2 * _integral(self.concentration, np.full_like(self.concentration, math.pi)))
+        return np.log(2 * half_circle(self.concentration, np.full_like(self.concentration, math.pi)))
 
     def sample(self, generator: np.random.Generator, count: int) -> Array:
         shape = (count, *self.batch, *self.event)
@@ -44,11 +50,11 @@ class VonMises(Density):
         return self.location
 
     def entropy(self) -> Value:
-        points, weights = _rule(self.concentration, np.full_like(self.concentration, math.pi))
+        points, weights = half_circle_rule(self.concentration, np.full_like(self.concentration, math.pi))
         half = np.sin(points / 2) ** 2
         mass = weights * np.exp(-2 * self.concentration * half)
         mean = (mass * 2 * half).sum(0) / mass.sum(0)  # E[1 - cos]
-        value = (self._log_total() + self.concentration * mean).sum(-1)
+        value = (self._log_total + self.concentration * mean).sum(-1)
         return Value(value, np.zeros_like(value))
 
     def marginal(self, index: int) -> "VonMises":
@@ -72,27 +78,13 @@ class VonMises(Density):
         )
 
 
-def _rule(concentration: Array, angle: Array) -> tuple[Array, Array]:
-    """Return points and weights of Gauss's rule from 0 to `angle`, or to where the density ends."""
-    sine = np.sqrt(_LEAST / 2 / np.maximum(concentration, _LEAST / 2))  # κ (1 - cos θ) = 2 κ sin²(θ/2)
-    end = np.minimum(angle, 2 * np.arcsin(sine))
-    shape = (-1, *(1,) * np.ndim(end))
-    return end / 2 * (1 + _NODES.reshape(shape)), end / 2 * _WEIGHTS.reshape(shape)
-
-
-def _integral(concentration: Array, angle: Array) -> Array:
-    """Return ∫ exp(κ (cos θ - 1)) dθ from 0 to `angle` in [0, π]."""
-    points, weights = _rule(concentration, angle)
-    return (weights * np.exp(-2 * concentration * np.sin(points / 2) ** 2)).sum(0)
-
-
 def _below(concentration: Array, angle: Array) -> Array:
     """Return the probability from the mean to `angle` in [-π, 3π), with the sign of the angle."""
     turns = np.floor((angle + math.pi) / (2 * math.pi))
     angle = angle - 2 * math.pi * turns
     concentration = np.broadcast_to(concentration, angle.shape)
-    share = _integral(concentration, np.abs(angle)) / (
-        2 * _integral(concentration, np.full_like(angle, math.pi))
+    share = half_circle(concentration, np.abs(angle)) / (
+        2 * half_circle(concentration, np.full_like(angle, math.pi))
     )
     return turns + np.sign(angle) * share
 

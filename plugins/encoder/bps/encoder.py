@@ -10,6 +10,7 @@ from torch import Tensor
 from framework.encoder import Encoder
 from framework.errors import ConfigError
 from framework.geometry.clouds import Normalisation, require_clouds
+from framework.geometry.nearest import Queries
 from framework.storage.weights import FINITE, require_state
 from plugins.encoder.bps import basis as sets
 from plugins.encoder.bps.encoding import (
@@ -106,6 +107,8 @@ class BPS(Encoder):
 
     def prepared_basis(self) -> Basis:
         """Return the basis prepared for search; it is prepared again only if its device, dtype or values changed."""
+        if torch.compiler.is_exporting():  # a trace compares no values
+            return Basis(self.basis, Queries(self.basis))
         cached = self._prepared
         if cached is None or not _same(cached.points, self.basis):
             # a copy, which stays as it is if the buffer is changed in place

@@ -121,7 +121,7 @@ def encode(
     counts = sizes(clouds)
     local, centre, scale = normalise_clouds(clouds, normalise, counts)
     reach_of_inliers = 1.0
-    if normalise == "none":
+    if normalise == "none" and not torch.compiler.is_exporting():  # a trace depends on no value
         reach = max(1.0, float(basis.points.abs().max()))
         require_normalised(local[..., :3], reach, counts, by="encoder bps")
         reach_of_inliers = (
@@ -162,7 +162,8 @@ def encode_distances(clouds: Tensor, basis: Basis) -> Float[Tensor, "batch k"] |
     checks and tensors that this function leaves out take half as long as the search itself.
     """
     if (
-        clouds.device.type != "cpu"
+        torch.compiler.is_exporting()  # first, because a trace depends on no size
+        or clouds.device.type != "cpu"
         or not clouds.dtype == basis.points.dtype == torch.float32
         or clouds.dim() != 3
         or clouds.shape[2] != 3

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from framework.errors import ConfigError
 from plugins.encoder.bps.symmetric import EQUAL, symmetric_frame
 
 LARGEST_NORM = 1 + 1e-6
@@ -44,6 +45,8 @@ def frame(coordinates: Float[Tensor, "batch points 3"], reach: float = 1.0) -> F
         coordinates: coordinates relative to the origin; rows of NaN are padding.
         reach: norm beyond which points are outliers, which do not influence the axes.
     """
+    if torch.compiler.is_exporting():
+        raise ConfigError("The axes of a cloud are eigenvectors, for which ONNX has no operation.")
     points = coordinates.double()
     norm = torch.linalg.vector_norm(points.detach(), dim=-1, keepdim=True)
     inside = norm <= LARGEST_NORM * reach  # False for NaN

@@ -65,7 +65,7 @@ def occupancy(clouds: Float[Tensor, "batch points columns"], side: int) -> Float
     position = ((coordinates.double() + 1) / 2 * side).nan_to_num(0, 0, 0).clamp(0, side - 1).long()
     cell = (position[..., 0] * side + position[..., 1]) * side + position[..., 2]
     cell = cell.where(inside, side**3)  # an extra cell collects the points that lie in no cell
-    occupied = coordinates.new_zeros(len(clouds), side**3 + 1)
+    occupied = coordinates.new_zeros(clouds.shape[0], side**3 + 1)
     return occupied.scatter_(1, cell, 1.0)[:, :-1]
 
 

@@ -84,7 +84,7 @@ def truncated_distance(
             ]
         )
         numbers.append([cell.clamp(0, side - 1).long() * stride for cell in cells])
-    square = clouds.new_full((len(clouds), side**3), truncation**2)
+    square = clouds.new_full((clouds.shape[0], side**3), truncation**2)
     for x, y, z in itertools.product(range(2 * reach + 1), repeat=3):
         # the centre of a cell that is n steps away is at least n - 1/2 edges away
         if sum(max(abs(step - reach) - 1 / 2, 0) ** 2 for step in (x, y, z)) >= truncation**2:

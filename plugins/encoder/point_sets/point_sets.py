@@ -82,7 +82,8 @@ class CloudNetwork(Encoder):
         columns, most, normalise = self.reading
         dtype = next(self.parameters()).dtype
         values, counts = concatenate_points(inputs, normalise, columns=columns, most=most, dtype=dtype)
-        if self.training or torch.is_grad_enabled():  # batch norm in training needs the whole batch at once
+        # batch norm in training needs the whole batch at once, and a trace depends on no number of points
+        if self.training or torch.is_grad_enabled() or torch.compiler.is_exporting():
             return self.encode(values, counts)
         return encode_in_parts(self.encode, values, counts, self.rows_per_point)
 
@@ -110,6 +111,10 @@ def concatenate_points(
     counts = sizes(clouds)
     points = normalise_clouds(clouds, normalise, counts).clouds[:, :most, :columns].to(dtype)
     counts = counts if most is None else counts.clamp(max=most)
+    if torch.compiler.is_exporting():
+        # in a trace all clouds have equally many rows: copies of the first point in place of padding change no maximum
+        real = torch.arange(points.shape[1], device=points.device) < counts[:, None]
+        return points.where(real[..., None], points[:, :1]).flatten(0, 1), counts
     if all_have(counts, points.shape[1]):
         return points.flatten(0, 1), counts
     real = torch.arange(points.shape[1], device=points.device) < counts[:, None]
@@ -120,7 +125,9 @@ def largest(
     values: Float[Tensor, "point channels"], counts: Int[Tensor, "batch"]
 ) -> Float[Tensor, "batch channels"]:
     """Return the maximum of each channel over the points of each cloud; every cloud has at least one point."""
-    count, channels = len(counts), values.shape[1]
+    count, channels = counts.shape[0], values.shape[1]
+    if torch.compiler.is_exporting():
+        return values.unflatten(0, (count, -1)).amax(1)
     if count == 0:
         return values.new_zeros(0, channels)
     if all_have(counts, len(values) // count):

@@ -116,5 +116,7 @@ def multiply_by_matrices(
     counts: Int[Tensor, "batch"],
 ) -> Float[Tensor, "point size"]:
     """Return every point times the matrix of its cloud."""
+    if torch.compiler.is_exporting():
+        return (values.unflatten(0, (counts.shape[0], -1)) @ matrices).flatten(0, 1)
     parts = zip(values.split(counts.tolist()), matrices, strict=True)
     return torch.cat([values[:0], *(part @ matrix for part, matrix in parts)])

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from framework.errors import ConfigError
 from framework.geometry.farthest import farthest
 
 Choice = Literal["random", "farthest"]
@@ -34,6 +35,8 @@ def choose_points(
         seed: seed of "random".
     """
     if choice == "random":
+        if torch.compiler.is_exporting():
+            raise ConfigError("The random choice of points depends on the number of points of each cloud.")
         rows = [_random(size, count, seed) for size in counts.tolist()]
         return torch.stack(rows).to(clouds.device) if rows else counts.new_zeros(0, count)
     return farthest(clouds[..., :3], counts, count)

@@ -110,7 +110,7 @@ class Canvas:
         """
         weight, bias = head.weight, head.bias
         assert bias is not None
-        if not len(inputs):
+        if inputs.shape[0] == 0:
             outputs = head.out_channels // self.shuffle**2
             return weight.new_zeros(0, outputs, *inputs.shape[2:]), None
         images = inputs.to(weight.dtype)
@@ -196,6 +196,8 @@ def subject_box(image: Float[Tensor, "channels height width"], stride: int, marg
 
     The box is widened by `margin` pixels within the image, then to multiples of `stride`.
     """
+    if torch.compiler.is_exporting():
+        raise ConfigError("A crop depends on the pixels of each image. Train the model with crop=null.")
     shown = (image.detach() != EMPTY).view(torch.uint8).amax(0)  # true for NaN; bytes have a faster maximum
     ends: list[int] = []
     for line in (shown.amax(1), shown.amax(0)):

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from framework.distributions.numpy_densities import STEPS, Array, Density, Value, wrap
+from framework.distributions.numpy_densities import STEPS, Array, Density, Interval, Value, wrap
 
 
 class PredictionSet(Density):
@@ -19,7 +19,12 @@ class PredictionSet(Density):
 
     def __init__(self, inner: Density, threshold: float | str, stated_probability: float) -> None:
         self.inner, self.threshold, self.stated_probability = inner, float(threshold), stated_probability
-        self.batch, self.event, self.circular = inner.batch, inner.event, inner.circular
+        self.batch, self.event, self.circular, self.by_draws = (
+            inner.batch,
+            inner.event,
+            inner.circular,
+            inner.by_draws,
+        )
 
     def contains(self, value: Array) -> Any:
         """Return whether each value (*sample, *batch, *event) is in its set, bool (*sample, *batch)."""
@@ -107,6 +112,9 @@ class PredictionSet(Density):
 
     def median(self) -> Array:
         return self.inner.median()
+
+    def interval(self, mass: float) -> Interval:
+        return self.inner.interval(mass)
 
     def entropy(self) -> Value:
         return self.inner.entropy()

@@ -13,6 +13,7 @@ from torch.distributions import Distribution
 
 from framework.calibration.module_flags import set_flag
 from framework.distributions.batch_shapes import Reshaped, Stacked
+from framework.distributions.given_draws import draws_are_given
 from framework.errors import ConfigError, UserError
 from framework.model import Model, Predictor
 from framework.storage.limits import MOST_DRAWS
@@ -87,7 +88,12 @@ class MCDropout(Uncertainty):
 
     def _components(self, inputs: Tensor) -> Distribution:
         """Return the densities of every input under its S masks, batch_shape (batch, S)."""
-        whole = (len(inputs), self.samples)
+        whole = (inputs.shape[0], self.samples)
+        if draws_are_given():  # as an exported model draws them: for the copies of all inputs together
+            copies = inputs if self.samples == 1 else inputs.repeat_interleave(self.samples, 0)
+            if isinstance(self.model, Model):
+                return self.model.head(self.model.raw(copies).unflatten(0, (-1, self.samples)))
+            return Reshaped(self.model(copies), whole)
         if self.samples == 1 or len(inputs) == 0:
             density = self.model(inputs)
             return Reshaped(density, whole) if self.samples == 1 else Stacked([density] * self.samples)

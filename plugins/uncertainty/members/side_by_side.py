@@ -9,8 +9,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.func import functional_call, vmap
 
+from framework.model import RawNetwork
 
-class SideBySide(nn.Module):
+
+class SideBySide(RawNetwork):
     """Module that computes several networks of one architecture in one pass, by batched matrix products.
 
     The networks are the members of an ensemble; the first dimension of each stacked parameter is the member. An
