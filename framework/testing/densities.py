@@ -39,7 +39,7 @@ from framework.testing.protocol_checks import (
     check_recentre,
     mix_pairs,
 )
-from framework.testing.quadrature import cells, count_samples, density_at, integral_around_draws, side
+from framework.testing.quadrature import cells, cells_around_draws, count_samples, density_at, side
 
 DRAWS = 20_000
 UNSEEN = 3.3
@@ -223,7 +223,7 @@ def integral(density: Distribution, worst: Worst) -> None:
         quadrature = boxes(density)
         total = quadrature.mean(torch.ones_like(quadrature.log_prob))
     elif density.event_shape == (3,) and not isinstance(density.support, Circular):
-        total = integral_around_draws(density)
+        total = cells_around_draws(density).mass.sum((0, 1, 2))
     else:
         _, mass = cells(density)
         total = mass.sum(tuple(range(max(1, len(density.event_shape) and density.event_shape[0]))))
@@ -278,15 +278,19 @@ def samples_follow_log_prob(density: Distribution, worst: Worst) -> None:
     """Check by a χ² test over cells that draws follow log_prob; the error is a standard normal deviate.
 
     χ² is converted to a normal deviate by the formula of Wilson & Hilferty (1931). Draws of one number are counted in
-    cells of equal mass from the quadrature, draws of several numbers on a grid. Cells with an expectation of fewer than
-    five draws are merged into one.
+    cells of equal mass from the quadrature, draws of several numbers on a grid. If the numbers are real, further draws
+    determine its place, width and correlation. Cells with an expectation of fewer than five draws are merged into one.
     """
     seed(SEED)
     draws = density.sample(torch.Size((DRAWS,)))
     if density.event_shape == (1,):
         _compare_draws(density, draws, worst, "")
         return
-    borders, mass = cells(density)
+    if density.event_shape and not isinstance(density.support, Circular):
+        grid = cells_around_draws(density)
+        borders, mass, draws = grid.borders, grid.mass, grid.standardise(draws)
+    else:
+        borders, mass = cells(density)
     count = count_samples(density, borders, draws)
     batch = density.batch_shape
     _chi_square(DRAWS * mass.reshape(-1, *batch), count.reshape(-1, *batch), worst, "")

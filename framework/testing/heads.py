@@ -238,7 +238,8 @@ def _rows_apart(subject: HeadSubject, worst: Worst) -> None:
                 where = f"of rows {start} to {start + 2} in a batch of {MANY_ROWS}"
                 for name, big, small in (
                     ("log_prob", whole.log_prob(value)[few], part.log_prob(value[few])),
-                    ("mode", whole.mode[few].float(), part.mode.float()),
+                    # not the modes themselves: around a flat peak, float32 does not tell one place from the next
+                    ("log_prob at the mode", part.log_prob(whole.mode[few]), part.log_prob(part.mode)),
                 ):
                     gap = (big - small).abs() > 1e-4 * small.abs().clamp(min=1)
                     worst.count(gap, f"{name} {where}")

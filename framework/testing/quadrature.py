@@ -1,6 +1,7 @@
 """Integrals of any density on a fixed grid: the masses of the cells of its domain."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -47,27 +48,51 @@ def cells(density: Distribution) -> tuple[list[Tensor], Tensor]:
     return [borders for _, _, borders in sides], mass.sum(tuple(range(1, 2 * numbers, 2)))
 
 
-def integral_around_draws(density: Distribution) -> Tensor:
-    """Return the integral of a density of three real numbers, (*batch), float64.
+@dataclass(frozen=True)
+class DrawnGrid:
+    """Grid of cells over real numbers whose centre, width and correlation are those of draws, for each batch row.
 
-    The grid of each batch row has the centre, width and correlation of draws. Draws that lie far from the others change
-    the width little.
+    Draws that lie far from the others change the width little.
+
+    Attributes:
+        borders: Borders of the cells along each standard number, (cells per side + 1,).
+        mass: Integral of the density over each cell, (*cells, *batch), float64.
+        centre: (*batch, number), float64.
+        root: Upper triangular matrix R, (*batch, number, number): a value is centre + Rᵀ · standard numbers.
     """
+
+    borders: list[Tensor]
+    mass: Tensor
+    centre: Tensor
+    root: Tensor
+
+    def standardise(self, value: Tensor) -> Tensor:
+        """Return values, (draws, *batch, number), as standard numbers."""
+        offset = (value.double() - self.centre).movedim(0, -1)
+        return torch.linalg.solve_triangular(self.root.mT, offset, upper=False).movedim(-1, 0)
+
+
+def cells_around_draws(density: Distribution) -> DrawnGrid:
+    """Return cells of a density of two or three real numbers, on a grid that new draws from the density determine."""
+    numbers = density.event_shape[0]
     draws = density.sample(torch.Size((4096,))).double()
-    low, center, high = (draws.quantile(share, 0) for share in (0.16, 0.5, 0.84))
-    offset = draws - center
+    low, centre, high = (draws.quantile(share, 0) for share in (0.16, 0.5, 0.84))
+    offset = draws - centre
     most = 5 * (high - low)
     _, root = torch.linalg.qr(offset.clamp(-most, most).movedim(0, -2) / len(draws) ** 0.5)
-    axis, slope, _ = side(density, 0, REAL_POINTS[3], CELLS[3])
-    node = torch.cartesian_prod(axis, axis, axis)
-    weight = torch.cartesian_prod(slope, slope, slope).prod(-1)
-    volume = root.diagonal(dim1=-2, dim2=-1).abs().prod(-1)
-    total = torch.zeros(density.batch_shape, dtype=torch.float64)
+    points, count = REAL_POINTS[numbers], CELLS[numbers]
+    axis, slope, border = side(density, 0, points, count)
+    node = torch.cartesian_prod(*[axis] * numbers)
+    weight = torch.cartesian_prod(*[slope] * numbers).prod(-1)
+    dtype = density.sample(torch.Size((0,))).dtype
+    mass = []
     for part, share in zip(node.split(2**14), weight.split(2**14), strict=True):
-        value = center + torch.einsum("pi,...ij->p...j", part, root)
-        mass = density.log_prob(value.to(density.sample(torch.Size((0,))).dtype)).double().exp()
-        total = total + torch.einsum("p...,p->...", mass, share)
-    return total * volume
+        value = centre + torch.einsum("pi,...ij->p...j", part, root)
+        density_there = density.log_prob(value.to(dtype)).double().exp()
+        mass.append(density_there * share.reshape(-1, *(1,) * len(density.batch_shape)))
+    volume = root.diagonal(dim1=-2, dim2=-1).abs().prod(-1)
+    whole = (torch.cat(mass) * volume).reshape(*(count, points // count) * numbers, *density.batch_shape)
+    return DrawnGrid([border] * numbers, whole.sum(tuple(range(1, 2 * numbers, 2))), centre, root)
 
 
 def density_at(density: Distribution, points: Tensor) -> Tensor:
