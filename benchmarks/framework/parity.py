@@ -22,7 +22,7 @@ from benchmarks.pages import machine, write_page
 from framework.configuration.assembly import build_predictor
 from framework.configuration.description import Description
 from framework.configuration.registry import installed
-from framework.configuration.schema import resolve
+from framework.configuration.schema import build, resolve
 from framework.data import Data
 from framework.deployment import export as exporting
 from framework.errors import UserError
@@ -123,15 +123,14 @@ def of_heads() -> Iterator[dict[str, str]]:
             part = {"name": head, **row.config}
             result = export([MLP], part, row.target, vectors())
             if result.get("reason", "").startswith("no model"):
-                result = export([], part, row.target, EncoderRow("raw", _raw_shape(part, row.target)))
+                result = export([], part, row.target, EncoderRow("raw", (_size(part, row.target),)))
             yield {"encoder": "mlp", "row": "six numbers", "head": head, "head row": row.name, **result}
 
 
-def _raw_shape(part: Part, target: Target) -> tuple[int, ...]:
-    """Return the shape of the raw parameters of a head that reads features themselves."""
-    from framework.configuration.schema import build
-
-    return tuple(build("density_head", resolve("density_head", part), target=target).raw_shape)
+def _size(part: Part, target: Target) -> int:
+    """Return the number of raw parameters of a head that reads features themselves."""
+    size: int = build("density_head", resolve("density_head", part), target=target).size
+    return size
 
 
 def of_wrappers() -> Iterator[dict[str, str]]:
