@@ -407,6 +407,17 @@ def test_narrow_errors_fill_their_panel_and_negative_ones_are_not_logarithmic() 
     assert diagram(below_zero).axes[0].get_yscale() == "linear"
 
 
+def test_a_long_legend_leaves_the_panel_its_height() -> None:
+    for methods in (2, 20, 45):
+        rows = [
+            {**FIRST[0], "method": f"a method with a long name, strength={number}"}
+            for number in range(methods)
+        ]
+        figure = diagram(rows)
+        height = figure.axes[0].get_position().height * figure.get_figheight()
+        assert height > 2, f"{methods} methods leave {height:.2f} inches"
+
+
 def test_several_numbers_have_a_panel_each(tmp_path: Path) -> None:
     rows = [{**row, "accuracy": 0.9, "nll": 0.1 * row["error"]} for row in FIRST]
     labels = {"error": "error", "accuracy": "accuracy", "nll": "NLL", "error_sem": "its error"}

@@ -32,6 +32,8 @@ FRONT = "front"
 """Matplotlib identifier (gid) of the rings around the points of the Pareto front."""
 SHADE = "0.87"
 """Grey level of the area in which errors are not meaningful."""
+LEGEND_LINE = 0.21
+"""Height of a line of the legend, inches."""
 ACROSS = 3
 """Largest number of panels side by side."""
 
@@ -224,6 +226,8 @@ def _legends(
     handles += [Patch(color=SHADE, label=meaning) for meaning in shaded]
     longest = max((len(str(handle.get_label())) for handle in handles), default=0)
     columns = max(1, int(figure.get_figwidth() / (0.7 + 0.08 * longest)))  # inches
+    lines = -(-len(handles) // columns)
+    figure.set_figheight(figure.get_figheight() + LEGEND_LINE * max(0, lines - 4))
     style: Style = {"fontsize": 9, "frameon": False}
     legend = figure.legend(
         handles=handles,
