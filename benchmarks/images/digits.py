@@ -10,7 +10,6 @@ are split at random into training, validation and test. Runs are in outputs/swee
 import argparse
 import json
 import math
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,7 +22,7 @@ import yaml
 from torch import Tensor
 
 import framework
-from benchmarks.commands import ROOT
+from benchmarks.commands import ROOT, carry_out
 from benchmarks.pages import machine, publish
 from framework.configuration.schema import build, resolve
 from framework.datasets.fields import fetch
@@ -83,7 +82,7 @@ def _place(root: Path, name: str) -> tuple[str, ...]:
 
 
 def _run(*words: str) -> None:
-    subprocess.run([sys.executable, "-m", "framework", *words], cwd=ROOT, check=True)
+    carry_out([sys.executable, "-m", "framework", *words])
 
 
 def read_runs(name: str) -> dict[str, list[tuple[Path, Mapping[str, Any]]]]:
