@@ -19,7 +19,13 @@ from pydantic.fields import FieldInfo
 
 from framework.configuration.modes import MODES, UNUSED_BY_TRAINING
 from framework.configuration.registry import GROUPS, group_of
-from framework.configuration.settings import LoggerSettings, OptimizerSettings, Settings, TrainerSettings
+from framework.configuration.settings import (
+    BudgetSettings,
+    LoggerSettings,
+    OptimizerSettings,
+    Settings,
+    TrainerSettings,
+)
 from framework.configuration.signature import signature
 from framework.storage.path_marks import FilePath
 
@@ -66,6 +72,7 @@ MEANINGS = {
     "renderer": "Renderer, for `mode=check`.",
     "optimizer": "Optimiser: `optimizer=adamw`, `adam` or `sgd`; see below.",
     "trainer": "Training: `trainer=default` or `ddp`; see below.",
+    "budget": "Limit of run time or error, by which the knobs of a stored model are set; see below.",
     "logger": "Store of the runs: `logger=mlflow` or `none`; see below.",
     "mode.members": "Folder of a sweep, or a list of runs.",
     "mode.files": "Folder or files to read.",
@@ -100,6 +107,7 @@ def settings_page() -> str:
         ("`optimizer`", OptimizerSettings, "conf/optimizer/adamw.yaml"),
         ("`trainer`", TrainerSettings, "conf/trainer/default.yaml"),
         ("`logger`", LoggerSettings, "conf/logger/mlflow.yaml"),
+        ("`budget`", BudgetSettings, ""),
     ):
         prefix = title.strip("`")
         rows = [row for row in model_settings(model, file, f"{prefix}.") if row.key != f"{prefix}.name"]
@@ -146,8 +154,8 @@ def _readers() -> str:
 
 
 def model_settings(model: type[BaseModel], file: str, prefix: str = "") -> list[Setting]:
-    """Return the settings of a pydantic model, with the defaults and comments of a config file."""
-    text = (ROOT / file).read_text(encoding="utf-8")
+    """Return the settings of a pydantic model, with the defaults and comments of a config file if one is named."""
+    text = (ROOT / file).read_text(encoding="utf-8") if file else "{}"
     written, comments, texts = yaml.safe_load(text), yaml_comments(text), attribute_texts(model)
     return [
         Setting(

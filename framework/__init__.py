@@ -6,13 +6,13 @@ from importlib import import_module
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from framework.configuration.loading import load as load
     from framework.deployment.frozen import freeze as freeze
+    from framework.deployment.loaded import load as load
 
 __all__ = ["freeze", "load"]
 __version__ = "0.2.0"
 
-_LAZY = {"load": "framework.configuration.loading", "freeze": "framework.deployment.frozen"}
+_LAZY = {"load": "framework.deployment.loaded", "freeze": "framework.deployment.frozen"}
 
 
 def __getattr__(name: str) -> object:

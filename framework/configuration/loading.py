@@ -38,29 +38,13 @@ PREFIX = "predictor."
 def load(
     run_or_checkpoint: str | Path, *, uri: str | None = None, paths: Mapping[str, Any] | None = None
 ) -> Predictor:
-    """Return the trained model in evaluation mode, on the CPU; the model reads the user's own data.
-
-    `model(data)` returns the density over the target, with batch_shape (batch,). `data` are files, arrays or other
-    data that the data set accepts (`Data.inputs`). Angles are in radians, and real-valued targets in the unit of the
-    training data. A class is its index in `density.names`; for other targets, `density.names` are the names of the
-    numbers. The other methods of the model take inputs in the form that the data set produces.
-
-    Random numbers (latent variables, dropout, samples) come from torch's global generator, so `torch.manual_seed`
-    before a call makes the call repeatable. Loading takes no random number from this generator. The weights require no
-    gradient, so that NumPy, pandas and Matplotlib accept the results; call `model.requires_grad_()` to continue
-    training.
-
-    Args:
-        run_or_checkpoint: A run folder (`outputs/...`), a `.ckpt` file, or an MLflow run id.
-        uri: Tracking store of the run id; the local store under `outputs/` by default.
-        paths: Files and folders by their keys in the model's config, {"encoder.rasterised.body": "/my/body.npz"}. Paths
-            in the checkpoint itself are never used, because it may come from an untrusted source.
-
-    Raises:
-        CheckpointError: There is no checkpoint, it is damaged, or its weights do not fit the model that it describes.
-        ConfigError: The model needs a path that `paths` does not give.
-    """
+    """Return the trained model in evaluation mode, like `framework.load` without a budget; see its docstring."""
     predictor, description = load_with_description(run_or_checkpoint, uri=uri, paths=paths)
+    return for_user(predictor, description)
+
+
+def for_user(predictor: Predictor, description: Description) -> Predictor:
+    """Return a loaded model after adding its description and the hooks with which it reads the user's own data."""
     predictor.description = description
     predictor.requires_grad_(False)
     user = User(reader(description))

@@ -41,9 +41,11 @@ MODES: Mapping[str, Mode] = {
         (*_STORED, "checkpoint", "outliers", "uncertainty"), ("data", "outliers", "metric", *MODEL)
     ),
     "combine": Mode((*_STORED, "outliers", "uncertainty"), ("data", "outliers", "metric", *MODEL)),
-    "predict": Mode((*_RUN, *BUNDLES, "workers", "samples", "checkpoint", "data"), ("data", *MODEL)),
+    "predict": Mode(
+        (*_RUN, *BUNDLES, "workers", "samples", "checkpoint", "data", "budget"), ("data", *MODEL)
+    ),
     "encode": Mode((*_RUN, *BUNDLES, "batch_size", "workers", "data", "encoder")),
-    "export": Mode((*BUNDLES, "checkpoint"), ("data", *MODEL)),
+    "export": Mode((*BUNDLES, "checkpoint", "budget"), ("data", *MODEL)),
     "work_precision": Mode((*_STORED, "checkpoint"), ("data", "metric", *MODEL)),
     "check": Mode((*BUNDLES, *GROUPS)),
     "plugins": Mode(),

@@ -117,6 +117,43 @@ class LoggerSettings(_Strict):
     experiment: str | None = None
 
 
+class BudgetSettings(_Strict):
+    """Limit of the run time or of the error of a stored model, which decides how its knobs are set."""
+
+    milliseconds: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    """Largest run time per sample, ms; the model gets the best setting of its knobs within it."""
+    error: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    """Largest error on the validation split, in the unit of `metric`; the model gets the fastest setting within it."""
+    metric: str | None = None
+    """Key of the number of the model's metrics that is the error, such as `maad_deg`.
+
+    null takes the first for which lower is better. If higher is better, `error` is the smallest allowed number.
+    """
+    batch_size: Positive | None = None
+    """Number of samples of the batch whose run time is measured.
+
+    null takes 64 for mode=predict, which predicts so many at once, and 1 for mode=export and `framework.load`.
+    """
+
+    @model_validator(mode="after")
+    def _one_limit(self) -> "BudgetSettings":
+        if self.milliseconds is not None and self.error is not None:
+            raise ValueError(
+                "milliseconds and error are both set, but a budget limits one of them. Leave one of them out"
+            )
+        unused = [key for key in ("metric", "batch_size") if getattr(self, key) is not None]
+        if unused and not self.limits:
+            raise ValueError(
+                f"{unused[0]} has no effect without a limit. Set milliseconds or error, or leave {unused[0]} out"
+            )
+        return self
+
+    @property
+    def limits(self) -> bool:
+        """Return true if there is a limit."""
+        return self.milliseconds is not None or self.error is not None
+
+
 class TrainerSettings(_Strict):
     """Keys of `trainer`: the framework's own, and the arguments of pytorch_lightning.Trainer that a config can hold.
 
@@ -193,6 +230,7 @@ class Settings(_Strict):
     optimizer: OptimizerSettings = OptimizerSettings()
     logger: LoggerSettings = LoggerSettings()
     trainer: dict[str, Any] = {}
+    budget: BudgetSettings = BudgetSettings()
     mode: dict[str, Any] = {}
     data: Any = None
     outliers: Any = None
@@ -211,7 +249,11 @@ class Settings(_Strict):
             ConfigError: The config contains `_target_`, a key is unknown, or a value is out of range.
         """
         forbid_targets(config)
-        for key, model in (("optimizer", OptimizerSettings), ("logger", LoggerSettings)):
+        for key, model in (
+            ("optimizer", OptimizerSettings),
+            ("logger", LoggerSettings),
+            ("budget", BudgetSettings),
+        ):
             if isinstance(config.get(key), Mapping):
                 check(model, config[key], key)
         check(cls, config, "")

@@ -1,7 +1,10 @@
 """Evaluation of a predictor on a split: metrics in total and per group, and the cost of a prediction."""
 
+import logging
 import math
+import warnings
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -162,6 +165,19 @@ def require_unique_name(owners: "dict[str, Metric]", name: str, metric: "Metric"
             f"Two metrics use the name {name!r}: {type(other).__name__} and {type(metric).__name__}. Leave one of "
             "them out, and compute it with mode=test for the same model."
         )
+
+
+@contextmanager
+def silence() -> Iterator[None]:
+    """Suppress warnings, and log messages below the level ERROR, during the block."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)
 
 
 @torch.no_grad()

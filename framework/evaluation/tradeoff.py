@@ -170,7 +170,7 @@ def tradeoff(
         return evaluation.total
 
     points: list[Point] = []
-    with _restore_afterwards(predictor, parts, knob, inputs.device), torch.no_grad():
+    with restored(predictor, parts, knob, inputs.device), torch.no_grad():
         # No two estimates share random numbers.
         *point_seeds, reference_seeds = (
             _seeds(stream, repeats) for stream in np.random.SeedSequence(seed).spawn(len(values) + 1)
@@ -322,7 +322,7 @@ def _check(
 
 
 @contextmanager
-def _restore_afterwards(
+def restored(
     predictor: Predictor, parts: Sequence[Uncertainty | DensityHead], knob: str, device: torch.device
 ) -> Iterator[None]:
     """Set evaluation mode inside the block; afterwards restore the mode, the knob and the random generators."""

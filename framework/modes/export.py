@@ -6,6 +6,7 @@ from framework.configuration.config import Config, Options
 from framework.configuration.loading import load_with_description
 from framework.configuration.paths import flatten
 from framework.deployment.export import export, require_packages
+from framework.deployment.loaded import apply_budget
 from framework.errors import ConfigError
 from framework.runs.session import set_up_process
 from framework.storage.enclosed import require_enclosed
@@ -30,6 +31,10 @@ def run(config: Config) -> None:
     predictor, description = load_with_description(
         checkpoint, uri=config.settings.logger.uri, paths=flatten(config.settings.stored)
     )
+    if config.settings.budget.limits:
+        description = apply_budget(
+            predictor, description, config.settings.budget, paths=flatten(config.settings.stored)
+        )
     content = export(predictor, description, into)
     parity = {name: numbers["parameters"] for name, numbers in content["parity"].items()}
     console.print(f"exported to {into}", soft_wrap=True)

@@ -14,11 +14,13 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.configuration.config import Config, Options
+from framework.configuration.paths import flatten
 from framework.configuration.settings import Settings
 from framework.data import Batch, Data, Mapped
 from framework.distributions.intervals import DRAWS
 from framework.distributions.noise import Draw
 from framework.distributions.protocol import value_set
+from framework.errors import ConfigError
 from framework.evaluation.prediction_sets import (
     interval_columns,
     require_interval,
@@ -29,7 +31,7 @@ from framework.evaluation.splits import BLOCK, predict
 from framework.model import Predictor
 from framework.prediction import Prediction, table_columns
 from framework.runs.run import open_run
-from framework.runs.session import for_trained, note_idle_samples
+from framework.runs.session import Session, for_trained, note_idle_samples
 from framework.runs.user_files import UNREADABLE, list_files, print_left_out, select_files
 from framework.storage.names import spell_name
 from framework.target import Target
@@ -59,10 +61,13 @@ def run(config: Config) -> None:
     print_left_out(session.console, "folders", "not looked into", folders)
     if options.interval:
         require_interval(session.target, options.interval, by="mode.interval")
+    remark = _apply_budget(session, None if files else session.data, options.interval)
     unreadable: list[Path] = []
     if len(files) > 1:
         files, unreadable = select_files(session.data, files, session.parts["data"], session.console)
     with open_run(session.config) as run:
+        if remark:
+            run.tracker.set_tags({"budget": remark})
         if unreadable:
             (run.folder / UNREADABLE).write_text(
                 "".join(f"{spell_name(file)}\n" for file in unreadable), encoding="utf-8"
@@ -96,6 +101,47 @@ def run(config: Config) -> None:
             for map_file in _maps(session.data, files, mapped, run.folder / "maps"):
                 run.tracker.log_artifact(map_file, "maps")
             session.console.print(f"maps in {run.folder / 'maps'}", soft_wrap=True)
+
+
+def _apply_budget(session: Session, data: Data | None, mass: float | None) -> str:
+    """Set the knobs of the session's model to meet the command's budget, print why, and return that; "" without one.
+
+    Args:
+        session: Session of the command.
+        data: Prepared data whose validation split is used; None prepares the data of the model.
+        mass: Probability of the intervals.
+
+    Raises:
+        ConfigError: No setting meets the budget, or the budget sets the batch size.
+    """
+    budget = session.settings.budget
+    if not budget.limits:
+        return ""
+    if budget.batch_size not in (None, BLOCK):
+        raise ConfigError(
+            f"budget.batch_size = {budget.batch_size}: mode=predict always predicts {BLOCK} samples at once. Leave "
+            "budget.batch_size out."
+        )
+    from framework.deployment.loaded import apply_budget
+
+    def row(prediction: Prediction) -> None:
+        table_columns(session.target, prediction)
+        _intervals(session.target, prediction, mass)
+
+    assert session.stored is not None
+    description = apply_budget(
+        session.predictor,
+        session.stored,
+        budget,
+        paths=flatten(session.settings.stored),
+        data=data,
+        settings=session.settings,
+        batch_size=BLOCK,
+        work=row,
+    )
+    remark = description.remarks[-1]
+    session.console.print(remark, soft_wrap=True, highlight=False, markup=False)
+    return remark
 
 
 @torch.no_grad()

@@ -5,7 +5,6 @@ import logging
 import platform
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
@@ -51,7 +50,7 @@ from framework.density_head import Fitted
 from framework.distributions.noise import Draw, seed_step
 from framework.distributions.protocol import median
 from framework.errors import CheckpointError, ConfigError, UserError, shorten
-from framework.evaluation.splits import BLOCK, numbers, on_device, require_unique_name
+from framework.evaluation.splits import BLOCK, numbers, on_device, require_unique_name, silence
 from framework.model import Predictor, fitted_models, learns
 from framework.objective import Objective
 from framework.prediction import Prediction, true_image
@@ -94,6 +93,7 @@ class Session:
         objectives: Objectives of the training loss.
         metrics: New metrics without any state, in the order of the config; empty before `add_test_parts`.
         outliers: Prepared outliers, if a metric reads them; None before `add_test_parts`.
+        stored: Description of the stored model; None in a session for training.
     """
 
     config: Config
@@ -107,6 +107,7 @@ class Session:
     objectives: Sequence[Objective] = ()
     metrics: "Sequence[Metric]" = ()
     outliers: Data | None = None
+    stored: Description | None = None
 
     @property
     def settings(self) -> Settings:
@@ -384,7 +385,7 @@ def rehearse(session: Session) -> None:
     if session.outliers is not None:  # validation samples serve as outliers here
         predictions.append(Prediction(density, validation_batch, samples, "outliers"))
     # with so few samples, warnings have no meaning
-    with _silence():
+    with silence():
         for metric in session.metrics:
             trial = metric.clone()
             for prediction in predictions:
@@ -399,19 +400,6 @@ def rehearse(session: Session) -> None:
 def _first_samples(dataset: Dataset[Batch], most: int) -> Batch:
     """Return a batch of the first samples, at most `most`."""
     return fetch(dataset, range(min(most, len(dataset))))  # type: ignore[arg-type]
-
-
-@contextmanager
-def _silence() -> Iterator[None]:
-    """Suppress warnings, and log messages below the level ERROR, during the block."""
-    before = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logging.disable(before)
 
 
 def for_trained(config: Config, *, prepare: bool = True) -> Session:
@@ -491,7 +479,9 @@ def for_predictor(
         data.read = partial(_read_files, data.read, data, description, begun)  # type: ignore[method-assign]
     method = description.method or method_of(config, parts)
     introduce_model(description, method, data if prepare else None, console)
-    return Session(config, parts, method, description.target, data, predictor, device, console)
+    return Session(
+        config, parts, method, description.target, data, predictor, device, console, stored=description
+    )
 
 
 def _read_files(

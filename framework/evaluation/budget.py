@@ -1,0 +1,383 @@
+"""Cheapest setting of a model's knobs that meets a limit of run time or error, measured on this machine.
+
+The run times come from `run_times`, and the errors from `evaluate`, as in mode=work_precision. Every measurement that
+decides is repeated with the chosen setting, with other random numbers, before the setting is accepted. So no setting is
+chosen because it was lucky.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import product
+
+import torch
+from torch.utils.data import Dataset
+
+from framework.configuration.settings import BudgetSettings
+from framework.data import Batch, Data
+from framework.datasets.fields import fetch
+from framework.density_head import DensityHead
+from framework.distributions.noise import Draw
+from framework.errors import ConfigError, did_you_mean
+from framework.evaluation.cost import device_name
+from framework.evaluation.significance import Difference, paired_difference
+from framework.evaluation.splits import BLOCK, evaluate, predict, silence
+from framework.evaluation.tradeoff import first_knob, knob_owners, parts_with_knobs, restored, run_times
+from framework.metric import Metric
+from framework.model import Predictor
+from framework.prediction import Prediction
+from framework.storage.progress import track_progress
+from framework.uncertainty import Uncertainty
+
+MOST_SAMPLES = 10 * BLOCK
+"""Largest number of validation samples with which errors are measured."""
+LEAST_BATCHES = 10
+"""Smallest number of batches into which the validation samples are divided; settings are compared batch by batch."""
+CPU = torch.device("cpu")
+
+Setting = tuple[int, ...]
+"""Values of the knobs of a model, in the order of `Knobs.names`."""
+
+
+@dataclass(frozen=True)
+class Knobs:
+    """Knobs of a predictor.
+
+    Attributes:
+        names: names of the knobs, the outermost part first.
+        owners: for each knob, the wrappers or heads that have it (`knob_owners`).
+    """
+
+    names: tuple[str, ...]
+    owners: tuple[list[Uncertainty | DensityHead], ...]
+
+    @classmethod
+    def of(cls, predictor: Predictor) -> "Knobs":
+        """Return all knobs of a predictor.
+
+        Raises:
+            ConfigError: the predictor has no knob.
+        """
+        first_knob(predictor)
+        names = tuple(dict.fromkeys(name for part in parts_with_knobs(predictor) for name in part.knobs))
+        return cls(names, tuple(knob_owners(predictor, name) for name in names))
+
+    @property
+    def current(self) -> Setting:
+        """Values that the knobs have now."""
+        return tuple(getattr(parts[0], name) for name, parts in zip(self.names, self.owners, strict=True))
+
+    def settings(self) -> list[Setting]:
+        """Return all combinations of the values that the parts declare, and of their present values."""
+        present = self.current
+        return list(
+            product(
+                *(
+                    sorted({*parts[0].knobs[name], value})
+                    for name, parts, value in zip(self.names, self.owners, present, strict=True)
+                )
+            )
+        )
+
+    def set(self, setting: Setting) -> None:
+        """Give the knobs these values."""
+        for name, parts, value in zip(self.names, self.owners, setting, strict=True):
+            for part in parts:
+                setattr(part, name, value)
+
+    def text(self, setting: Setting) -> str:
+        """Return a setting as text, for example "members=2, samples=50"."""
+        return ", ".join(f"{name}={value}" for name, value in zip(self.names, setting, strict=True))
+
+
+@dataclass(frozen=True)
+class Measure:
+    """Number of a metric that says how large the error of a setting is.
+
+    Attributes:
+        metric: metric that computes the number.
+        key: key of the number.
+        sign: 1 if a lower number is better, and -1 if a higher one is.
+    """
+
+    metric: Metric
+    key: str
+    sign: int
+
+    @classmethod
+    def of(cls, metrics: Sequence[Metric], key: str | None) -> "Measure":
+        """Return the number `key` of `metrics`; by default the first that is better if it is lower.
+
+        Raises:
+            ConfigError: no metric has such a number.
+        """
+        measures = {
+            name: cls(metric, name, 1 if metric.better[name] == "lower" else -1)
+            for metric in metrics
+            for name in metric.columns
+            if name in metric.better and "outliers" not in metric.splits
+        }
+        if key is None:
+            key = next(
+                (name for name, measure in measures.items() if measure.sign > 0), next(iter(measures), "")
+            )
+        if key not in measures:
+            raise ConfigError(
+                f"budget.metric = {key!r}: the metrics of this model have no such number with a known direction."
+                f"{did_you_mean(key, measures)} They have {', '.join(measures) or 'none'}."
+            )
+        return measures[key]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Error of a setting on the validation samples.
+
+    Attributes:
+        value: the measure over all samples.
+        standard_error: its standard error over the samples; NaN if the metric states none.
+        batches: the measure of each batch.
+    """
+
+    value: float
+    standard_error: float
+    batches: tuple[float, ...]
+
+    def text(self) -> str:
+        """Return the value with its standard error."""
+        known = math.isfinite(self.standard_error)
+        return f"{self.value:.4g}" + (f" ± {self.standard_error:.2g}" if known else "")
+
+
+def meet_budget(
+    predictor: Predictor,
+    data: Data,
+    metrics: Sequence[Metric],
+    budget: BudgetSettings,
+    *,
+    samples: int,
+    seed: int,
+    batch_size: int = BLOCK,
+    work: Callable[[Prediction], object] = lambda prediction: prediction.point,
+) -> str:
+    """Set the knobs of a trained predictor to the cheapest setting that meets a budget, and say why in a sentence.
+
+    With a limit of the run time, the best of the settings within the limit is found, and of the settings that are as
+    good, the fastest is taken (`Bench.equals`, which compares batch by batch). With a limit of the error, it is the
+    fastest setting whose error on the validation samples is within the limit.
+
+    Args:
+        predictor: the predictor, in evaluation mode; its knobs are set.
+        data: prepared data, whose validation split is used.
+        metrics: metrics from which `budget.metric` is chosen.
+        budget: the limit.
+        samples: as in `Prediction`.
+        seed: seed of all random numbers.
+        batch_size: number of samples in the timed batch, if the budget says none.
+        work: what is computed from a prediction, beside the measure; its time counts.
+
+    Raises:
+        ConfigError: the predictor has no knob, no metric has the measure, or no setting meets the budget; the message
+            names the nearest one.
+    """
+    knobs, measure = Knobs.of(predictor), Measure.of(metrics, budget.metric)
+    bench = Bench(predictor, data.splits().validation, knobs, measure, samples, seed, work)
+    count = budget.batch_size or batch_size
+    stored = knobs.current
+    with ExitStack() as stack, torch.no_grad(), silence():
+        for name, parts in zip(knobs.names, knobs.owners, strict=True):
+            stack.enter_context(restored(predictor, parts, name, CPU))
+        bench.time_batch(count)
+        if budget.milliseconds is not None:
+            chosen, why = _within_time(bench, budget.milliseconds)
+        else:
+            assert budget.error is not None
+            chosen, why = _within_error(bench, budget.error)
+        milliseconds, errors = bench.milliseconds[chosen], bench.errors(chosen, 1)
+        beside = (
+            "" if chosen == stored else f" Before, {knobs.text(stored)} took {bench.compare(stored, chosen)}."
+        )
+    knobs.set(chosen)
+    place = f"{device_name(CPU)} with threads={torch.get_num_threads()}"
+    return (
+        f"budget: {knobs.text(chosen)} takes {milliseconds:.3g} ms per sample with {measure.key} {errors.text()}; "
+        f"{why}.{beside} Measured on {place}, in batches of {len(bench.timed['input'])}, errors with the first "
+        f"{bench.count} validation samples."
+    )
+
+
+class Bench:
+    """Measurements of settings, each made once.
+
+    Args:
+        predictor: the predictor.
+        validation: validation split.
+        knobs: knobs of the predictor.
+        measure: measure of the error.
+        samples: as in `Prediction`.
+        seed: seed of all random numbers.
+        work: as in `meet_budget`.
+
+    Attributes:
+        milliseconds: run time per sample of each setting.
+        count: number of validation samples with which errors are measured.
+        timed: batch with which run times are measured.
+    """
+
+    timed: Batch
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        validation: Dataset[Batch],
+        knobs: Knobs,
+        measure: Measure,
+        samples: int,
+        seed: int,
+        work: Callable[[Prediction], object],
+    ) -> None:
+        self.predictor, self.validation, self.knobs, self.measure = predictor, validation, knobs, measure
+        self.samples, self.seed, self.work = samples, seed, work
+        self.count = min(len(validation), MOST_SAMPLES)  # type: ignore[arg-type]
+        self.milliseconds: dict[Setting, float] = {}
+        self._errors: dict[tuple[Setting, int], Errors] = {}
+
+    def time_batch(self, size: int) -> None:
+        """Measure the run time of every setting on a batch of `size` validation samples, and keep the batch."""
+        size = min(size, len(self.validation))  # type: ignore[arg-type]
+        self.timed = fetch(self.validation, range(size))
+        settings = self.knobs.settings()
+        self.milliseconds = dict(zip(settings, self._times(settings, calls=3), strict=True))
+
+    def time_again(self, setting: Setting) -> float:
+        """Measure the run time of one setting again, with more calls, and return it, ms per sample."""
+        (self.milliseconds[setting],) = self._times([setting], calls=20)
+        return self.milliseconds[setting]
+
+    def _times(self, settings: Sequence[Setting], calls: int) -> list[float]:
+        reads = self.measure.metric.reads
+        metric = self.measure.metric.clone()
+
+        def compute(index: int) -> None:
+            self.knobs.set(settings[index])
+            prediction = predict(self.predictor, self.timed, self.samples, Draw(self.seed, 0), reads=reads)
+            self.work(prediction)
+            metric.update(prediction)
+            metric.reset()
+
+        seconds = run_times(compute, range(len(settings)), CPU, calls=calls, budget_seconds=10.0)
+        return [1e3 * time / len(self.timed["input"]) for time in seconds]
+
+    def errors(self, setting: Setting, repeat: int = 0) -> Errors:
+        """Return the error of a setting; different values of `repeat` use different random numbers."""
+        if (setting, repeat) not in self._errors:
+            self._errors[setting, repeat] = self._measure(setting, self.seed + repeat)
+        return self._errors[setting, repeat]
+
+    def _measure(self, setting: Setting, seed: int) -> Errors:
+        size = max(1, min(BLOCK, self.count // LEAST_BATCHES))
+        starts = range(0, self.count, size)
+        names = [str(number) for number in range(len(starts))]
+
+        def batches() -> Iterator[Batch]:
+            for number, start in enumerate(starts):
+                batch = fetch(self.validation, range(start, min(start + size, self.count)))
+                yield {**batch, "group": torch.full((len(batch["input"]),), number)}
+
+        self.knobs.set(setting)
+        evaluation = evaluate(
+            self.predictor,
+            batches(),
+            [self.measure.metric],
+            groups=names,
+            samples=self.samples,
+            seed=seed,
+            device=CPU,
+        )
+        key = self.measure.key
+        return Errors(
+            evaluation.total[key],
+            evaluation.total.get(f"{key}_sem", math.nan),
+            tuple(evaluation.groups[name][key] for name in names if name in evaluation.groups),
+        )
+
+    def worse(self, setting: Setting, other: Setting) -> Difference:
+        """Return by how much the error of a setting exceeds that of another: mean of paired differences of batches."""
+        pairs = zip(self.errors(setting).batches, self.errors(other).batches, strict=True)
+        finite = [pair for pair in pairs if all(map(math.isfinite, pair))]
+        return paired_difference(*([self.measure.sign * pair[side] for pair in finite] for side in (0, 1)))
+
+    def equals(self, setting: Setting, best: Setting) -> bool:
+        """Return whether the error of a setting is at most one standard error of the paired difference above the best.
+
+        This is the one-standard-error rule of Breiman et al. (1984), "Classification and regression trees", section
+        3.4.3, with the standard error of the difference.
+        """
+        difference = self.worse(setting, best)
+        return setting == best or difference.value <= difference.standard_error
+
+    def compare(self, setting: Setting, chosen: Setting) -> str:
+        """Return the run time and the error of a setting, and its difference from the chosen setting, as text."""
+        difference = self.worse(chosen, setting)
+        value = self.measure.sign * difference.value
+        error = f" ± {difference.standard_error:.2g}" if math.isfinite(difference.standard_error) else ""
+        return (
+            f"{self.milliseconds[setting]:.3g} ms with {self.measure.key} {self.errors(setting).text()} (paired "
+            f"difference of the new setting: {value:+.2g}{error})"
+        )
+
+    def score(self, setting: Setting) -> float:
+        """Return the error of a setting such that lower is better, and infinity for NaN."""
+        value = self.measure.sign * self.errors(setting).value
+        return math.inf if math.isnan(value) else value
+
+    def by_time(self) -> list[Setting]:
+        """Return all settings, the fastest first."""
+        return sorted(self.milliseconds, key=self.milliseconds.__getitem__)
+
+
+def _within_time(bench: Bench, limit: float) -> tuple[Setting, str]:
+    """Return the cheapest of the settings within a run time that are as good as the best of them, and the reason."""
+    fastest = bench.by_time()[0]
+    fitting = [setting for setting in bench.by_time() if bench.milliseconds[setting] <= limit] or [fastest]
+    for setting in track_progress(fitting, "measuring errors", len(fitting), "settings"):
+        bench.errors(setting)
+    while fitting:
+        best = min(fitting, key=bench.score)
+        chosen = next(setting for setting in fitting if bench.equals(setting, best))
+        if bench.time_again(chosen) <= limit:
+            text = f"the best of {len(fitting)} settings within budget.milliseconds={limit:g}"
+            if chosen == best:
+                return chosen, f"it is {text}"
+            return chosen, (
+                f"it is the cheapest that is within one standard error of {bench.knobs.text(best)}, {text}"
+            )
+        fitting = fitting[: fitting.index(chosen)]
+    names = ", ".join(bench.knobs.names)
+    raise ConfigError(
+        f"budget.milliseconds = {limit:g}: no setting of {names} is so fast on this machine. The nearest is "
+        f"{bench.knobs.text(fastest)}, with {bench.milliseconds[fastest]:.3g} ms per sample in batches of "
+        f"{len(bench.timed['input'])} and {bench.measure.key} {bench.errors(fastest).text()}. Raise the budget, or "
+        "choose a faster model."
+    )
+
+
+def _within_error(bench: Bench, limit: float) -> tuple[Setting, str]:
+    """Return the cheapest setting within an error, and the reason."""
+    order, key = bench.by_time(), bench.measure.key
+    sign, side = bench.measure.sign, "at most" if bench.measure.sign > 0 else "at least"
+    for setting in track_progress(order, "measuring errors", len(order), "settings"):
+        fresh = sign * bench.errors(setting, 1).value if bench.score(setting) <= sign * limit else math.nan
+        if fresh <= sign * limit:
+            bench.time_again(setting)
+            return (
+                setting,
+                f"it is the cheapest of {len(order)} with {key} {side} {limit:g}, also with other draws",
+            )
+    nearest, names = min(order, key=bench.score), ", ".join(bench.knobs.names)
+    raise ConfigError(
+        f"budget.error = {limit:g}: no setting of {names} reaches {key} {side} {limit:g} on the validation samples. "
+        f"The nearest is {bench.knobs.text(nearest)}, with {key} {bench.errors(nearest).text()} in "
+        f"{bench.milliseconds[nearest]:.3g} ms per sample. Allow a larger error, or choose a better model."
+    )
