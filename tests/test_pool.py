@@ -255,6 +255,15 @@ def test_the_others_go_on_when_a_job_fails_or_is_killed(app: App) -> None:
     assert begun[1] == {"what": "raise", "x": 0, "value": 1, "number": 0, "experiment_name": None}
 
 
+def test_jobs_that_fail_alike_are_listed_together(app: App) -> None:
+    code, output = app("what=raise,exit", "x=0,1")
+    assert code == 1
+    listed = output.rpartition("did not complete")[2]
+    assert listed.count("ValueError: this job is bad") == 1
+    assert "  #0, #1 failed: ValueError" in listed
+    assert "  #2, #3 failed: hello from exit" in listed
+
+
 def test_the_same_sweep_again_runs_what_did_not_complete(app: App) -> None:
     assert app("what=ok,once,raise", "x=1")[0] == 1
     assert [app.record(number)["status"] for number in range(3)] == ["completed", "died", "failed"]

@@ -29,6 +29,8 @@ from framework.tracking.signals import CLOSED, ENDING, SIGNALS, Stopped, collect
 
 COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework")
 """Command of a job, to which its overrides are added. It is no setting, because a config must not run code."""
+MOST_LISTED = 8
+"""Largest number of jobs with the same error whose numbers are listed."""
 MOST_LOSSES = 3
 """Largest number of times that a command starts a job again because the job was lost with its node."""
 LONGEST_VALUE = 4096
@@ -282,14 +284,21 @@ def run(
 
 
 def failure(jobs: Sequence[Job]) -> UserError | None:
-    """Return an error that lists the jobs that did not complete; None if all completed."""
+    """Return an error that lists the jobs that did not complete; None if all completed.
+
+    Jobs with the same error are listed together, with the console of the first one.
+    """
     bad = [job for job in jobs if job.record.get("status") != "completed" and not job.is_elsewhere]
     if not bad:
         return None
-    lines = [
-        f"  #{job.number} {job.record.get('status')}: {job.record.get('error')}  ({job.folder / CONSOLE})"
-        for job in bad
-    ]
+    alike: dict[tuple[object, object], list[Job]] = {}
+    for job in bad:
+        alike.setdefault((job.record.get("status"), job.record.get("error")), []).append(job)
+    lines = []
+    for (status, error), group in alike.items():
+        numbers = ", ".join(f"#{job.number}" for job in group[:MOST_LISTED])
+        more = f" and {len(group) - MOST_LISTED} more" if len(group) > MOST_LISTED else ""
+        lines.append(f"  {numbers}{more} {status}: {error}  ({group[0].folder / CONSOLE})")
     return UserError(
         f"{len(bad)} of {len(jobs)} jobs did not complete:\n" + "\n".join(lines) + "\n"
         "To run only these jobs again, repeat the command with hydra.sweep.dir=<folder of this sweep>."
