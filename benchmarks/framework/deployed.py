@@ -11,7 +11,7 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # this also limits the threads of NumPy's matrix products
 
-import json
+import importlib
 import re
 import sys
 import tempfile
@@ -31,6 +31,7 @@ from framework.data import Data, Preprocessing
 from framework.deployment import export as exporting
 from framework.deployment.frozen import freeze_predictor
 from framework.deployment.onnx_programs import Session
+from framework.errors import ConfigError
 from framework.model import Predictor
 from framework.target import Target
 
@@ -121,48 +122,56 @@ def export(case: Case, model: Predictor, folder: Path) -> None:
 
 
 def measure(case: Case) -> list[str]:
-    """Return the table rows of a model."""
+    """Return the table rows of a model; if it is not exported, the last one holds the reason."""
     model = build(case)
     frozen = freeze_predictor(model, case.shape)
-    lines = []
+    lines, refusal = [], ""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "exported"
-        export(case, model, folder)
-        sys.path.insert(0, str(folder))
         try:
-            from predict import load  # type: ignore[import-not-found]
-
-            exported = load(folder)
-        finally:
-            sys.path.remove(str(folder))
-            for module in [*exported.description["modules"], "predict"]:
-                sys.modules.pop(module, None)
-        session = Session(folder / "model.onnx")
-        noise = json.loads((folder / "density.json").read_text())["noise"]
+            export(case, model, folder)
+        except ConfigError as error:
+            refusal = str(error)
+        exported = None if refusal else load(folder)
         for count in BATCHES:
             generator = torch.Generator().manual_seed(count)
             if len(case.shape) == 3:
                 inputs = torch.randint(0, 256, (count, *case.shape), generator=generator, dtype=torch.uint8)
             else:
                 inputs = torch.randn(count, *case.shape, generator=generator)
-            array = inputs.numpy()
-            inputs_by_name = {"input": array, **exported._random(count, 0)} if noise else {"input": array}
             calls: dict[str, Callable[[], object]] = {
                 "PyTorch model": lambda inputs=inputs: model(inputs),
                 "frozen": lambda inputs=inputs: frozen.density(inputs),
-                "ONNX Runtime": lambda inputs_by_name=inputs_by_name: session.run(None, inputs_by_name),
-                "exported folder": lambda array=array: exported(array),
             }
+            if exported is not None:
+                array, session = inputs.numpy(), Session(folder / "model.onnx")
+                by_name = {"input": array} | exported._random(count, 0)
+                calls |= {
+                    "ONNX Runtime": lambda session=session, by_name=by_name: session.run(None, by_name),
+                    "exported folder": lambda array=array, exported=exported: exported(array),
+                }
             with torch.no_grad():
                 times = time_interleaved(calls, rounds=ROUNDS, seconds=0.15)
             lines += rows(case.title, count, times)
-    return lines
+    return [*lines, *([f"| {case.title} | any | exported folder | {refusal} | |"] if refusal else [])]
+
+
+def load(folder: Path) -> Any:
+    """Return an exported model, loaded by the code of its folder."""
+    sys.path.insert(0, str(folder))
+    try:
+        exported = importlib.import_module("predict").load(folder)
+    finally:
+        sys.path.remove(str(folder))
+    for module in [*exported.description["modules"], "predict"]:
+        sys.modules.pop(module, None)
+    return exported
 
 
 def rows(title: str, count: int, times: dict[str, Rounds]) -> list[str]:
     """Return the table rows of a model for a batch size."""
     best = min(rounds.median for rounds in times.values())
-    shipped = min(times[name].median for name in ("frozen", "exported folder"))
+    shipped = min(times[name].median for name in ("frozen", "exported folder") if name in times)
     lines = []
     for name, rounds in times.items():
         mark = f"{rounds.median / best:.2f}" + (" (fastest shipped)" if rounds.median == shipped else "")
@@ -191,8 +200,13 @@ def main() -> None:
         "form. The weights are random.\n\n"
         "| model | batch size | form | ms a call | of the best |\n|---|---|---|---|---|\n"
         f"{chr(10).join(lines)}\n\n"
-        f"The project requires that the faster one of the two forms that it ships takes at most {MOST} times as long "
-        "as the fastest form.\n\n"
+        f"The project requires that a form that it ships takes at most {MOST} times as long as the fastest form. Where "
+        "the exported folder takes longer, its check of the inputs and its object for the density take the additional "
+        "time, 0.05 to 0.1 ms a call, which count for small networks only. `ONNX Runtime` alone leaves them out, and "
+        "so is no form in which a model could be deployed. Basis points are the exception: the frozen model searches "
+        "the nearest points with compiled code, and an ONNX file can only multiply matrices. A small "
+        "classifier may be refused because of its rounding in float32: for extreme inputs, one of its numbers can be "
+        "close to 0 where the numbers in its layers are large.\n\n"
         f"{machine('torch', 'onnxruntime', 'numpy')} Command: `python -m benchmarks.framework.deployed`.\n"
     )
     write_page(__file__, text)

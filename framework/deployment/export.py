@@ -30,6 +30,7 @@ from torch import Tensor, nn
 from framework.configuration.description import Description
 from framework.configuration.loading import reader
 from framework.data import Preprocessing
+from framework.density_head import Fitted
 from framework.deployment import exported_folder
 from framework.deployment.frozen import freeze_predictor
 from framework.deployment.onnx_programs import PACKAGES, Session, quiet_export, write_onnx
@@ -192,6 +193,8 @@ def export(predictor: Predictor, description: Description, into: Path) -> Mappin
         raise ConfigError(f"{into} is not empty. Name a new folder, or empty this one.")
     bare = _without_hooks(predictor)
     model = Exporting(bare, description, reader(description).preprocessing())
+    if any(isinstance(part, Fitted) for part in bare.modules()):
+        raise _refusal(model, "Its density head is fitted in one step and is no network.")
     try:
         with (
             torch.no_grad()
@@ -381,9 +384,13 @@ def _write_network(
         try:
             program = torch.export.export(traced, arguments, dynamic_shapes=dynamic, strict=False)
             write_onnx(program, ["input", *(noise.name for noise in used)], names, str(file))
-            session = Session(file)
         except Exception as error:
             raise _refusal(model, _reason(error)) from error
+        try:
+            session = Session(file)
+        except Exception as error:
+            reason = shorten(str(error).rpartition("failed:")[2], 120)
+            raise _refusal(model, f"ONNX Runtime cannot load it ({reason}).") from error
     first = next(iter(program.graph_signature.user_inputs))
     node = next(node for node in program.graph.nodes if node.name == first)
     value: Any = node.meta["val"]
