@@ -9,6 +9,7 @@ and parity.md beside this file; the rows of parts that are not named are kept.
 """
 
 import csv
+import re
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -84,6 +85,7 @@ def export(
             parity = exporting.export(model, description, Path(folder) / "exported")["parity"]
         except UserError as error:
             reason = str(error).removeprefix("The model tried cannot be exported. ")
+            reason = re.sub(rf"{re.escape(tempfile.gettempdir())}/[\w/.-]+", "a folder", reason)
             return {"reason": reason.removesuffix(" Use framework.load or framework.freeze for it.")}
     numbers = {name: f"{parity[name]['parameters']:.1e}" for name in ("random", "extreme")}
     density = parity["random"].get("log_density")
@@ -193,6 +195,10 @@ def write(lines: Sequence[Mapping[str, str]]) -> None:
         "inputs, as a share of the largest number in a row; 1e-5 is allowed. Log-densities differ by at most "
         f"{worst['log-density']:.1e} for random inputs, as a share of max(1, |log-density|); 1e-4 is allowed.",
         "",
+        "Differences for extreme inputs are those of rounding in float32, and depend on the weights: where a number is "
+        "close to 0, the rounding of the large numbers in the layers is a large share of it. So a network with other "
+        "weights or widths may be refused; [deployed.md](deployed.md) has such a model.",
+        "",
         "## Refused models",
         "",
         "| encoder | density head | wrapper | reason |",
@@ -218,7 +224,11 @@ def write(lines: Sequence[Mapping[str, str]]) -> None:
 def _refusals(refused: Sequence[Mapping[str, str]]) -> list[str]:
     """Return the table rows of refused models, one for each reason and part."""
     lines: dict[str, None] = {}
+    heads = {(line["head"], line["reason"]) for line in refused if key(line) == "heads"}
     for line in refused:
+        # a head that no encoder changes is listed once
+        if key(line) not in ("heads", "wrappers") and (line["head"], line["reason"]) in heads:
+            continue
         encoder = f"{line['encoder']}: {line['row']}" if key(line) not in ("heads", "wrappers") else "any"
         head = f"{line['head']}: {line['head row']}" if line.get("head row") else "any"
         wrapper = line.get("wrapper") or "-"
