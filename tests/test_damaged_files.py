@@ -104,7 +104,6 @@ OWN_FILES = {
     "framework/scaffold/data/example.py": "an example for plugins; mode=check damages its files",
     "framework/tracking/watch.py": "/proc",
     "plugins/data/cest/data.py": "the cache, fitted again where it cannot be read",
-    "plugins/data/image_folder/corruption.py": "an image in memory that the module itself has compressed",
     "plugins/density_head/von_mises/coefficients.py": "the package's table of coefficients",
 }
 """Modules outside `framework.storage` that open files, and the files that they open."""

@@ -81,7 +81,8 @@ def compress(image: Pixels, quality: float, index: int) -> Pixels:
     pixels = image.permute(1, 2, 0).numpy()
     stream = BytesIO()
     Image.fromarray(pixels[..., 0] if len(image) == 1 else pixels).save(stream, "JPEG", quality=int(quality))
-    decoded = np.atleast_3d(np.asarray(Image.open(stream, formats=["JPEG"])))
+    with images.open_stream(stream) as file:
+        decoded = np.atleast_3d(np.asarray(images.decode(file, len(image), upright=False)))
     return torch.from_numpy(decoded.transpose(2, 0, 1).copy())
 
 

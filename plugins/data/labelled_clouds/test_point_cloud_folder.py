@@ -180,7 +180,7 @@ def test_other_layouts_are_refused(prepare_data, tmp_path):
     with pytest.raises(DataError, match=r"0 classes \(no folder\)"):
         prepare_data(root=tmp_path)
     cloud_file(tmp_path / "a" / "1.xyz")
-    with pytest.raises(DataError, match=r"1 classes \(a\), but at least two"):
+    with pytest.raises(DataError, match=r"1 classes \(a\), but at least 2"):
         prepare_data(root=tmp_path)
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "notes.txt").write_text("")
