@@ -304,10 +304,10 @@ of the true angle, and within 45° of the opposite angle.
 
 `experiment=images/classification` (one seed) classifies {classes["test_samples"]} test images:
 
-| accuracy, % | negative log-likelihood, nats | expected calibration error | minutes |
-|---:|---:|---:|---:|
+| accuracy, % | negative log-likelihood, nats | expected calibration error | ms / image | minutes |
+|---:|---:|---:|---:|---:|
 | {100 * classes["accuracy"]:.2f} ± {100 * classes["accuracy_sem"]:.2f} | {-classes["log_likelihood"]:.3f} | {
-            classes["ece"]:.4f} | {_minutes("classes"):.1f} |
+            classes["ece"]:.4f} | {classes["milliseconds_per_sample"]:.2f} | {_minutes("classes"):.1f} |
 
 ± is the standard error over the test images. The time is that of the whole command with one thread, while other work
 ran on the machine.
