@@ -96,7 +96,6 @@ OWN_FILES = {
     "framework/datasets/images.py": "within a guard",
     "framework/deployment/export.py": "the package's scripts for exported folders",
     "framework/deployment/exported_folder/predict.py": "runs without this package; test_export.py damages its input",
-    "framework/deployment/exported_folder/serve.py": "a request in memory; test_export.py damages it",
     "framework/evaluation/cost.py": "/proc",
     "framework/modes/new.py": "the package's own examples",
     "framework/modes/plugins.py": "the package's own modules",

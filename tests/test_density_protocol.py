@@ -70,7 +70,8 @@ WARM = torch.tensor(1.7, dtype=torch.float64)
 def refusal_of(part: Distribution) -> str:
     """Return the words that a refused temperature has: no such density exists, or none is registered."""
     dispatch = protocol.tempered_density.dispatch
-    unknown = dispatch(type(part)) is dispatch(object)
+    # a density of several numbers, or on another support, may fall back on the rule of all distributions
+    unknown = dispatch(type(part)) in (dispatch(object), dispatch(Distribution))
     return "protocol.tempered_density.register" if unknown else "cannot have the temperature"
 
 

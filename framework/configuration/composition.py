@@ -282,9 +282,9 @@ def _describe_unknown_key(cause: OmegaConfBaseException) -> str:
     assert cause.parent_node is not None
     key, root = str(cause.key), cause.parent_node._get_root()
     known = [str(name) for name in cause.parent_node if name != "hydra"]
-    elsewhere = {
-        path.rpartition(".")[2]: path for path in _dotted_keys(OmegaConf.to_container(root, resolve=False))
-    }
+    paths = _dotted_keys(OmegaConf.to_container(root, resolve=False))
+    # of several equal keys, the least nested one
+    elsewhere = {path.rpartition(".")[2]: path for path in sorted(paths, key=lambda path: -path.count("."))}
     beside = [*known, *groups()] if cause.parent_node is root else known
     near = key if key in elsewhere else nearest_name(key, beside) or nearest_name(key, elsewhere, 0.7)
     if cause.parent_node is root and key in beside:
