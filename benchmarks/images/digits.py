@@ -194,9 +194,15 @@ def corruption_rows() -> list[dict[str, Any]]:
     rows = [{"corruption": kind, "strength": 0, **_scores(clean)} for kind in CORRUPTIONS]
     for file in sorted(_folder("corrupted").glob("*/results.json")):
         words = yaml.safe_load((file.parent / "overrides.yaml").read_text(encoding="utf-8"))
-        said = dict(word.removeprefix("+stored.").split("=", 1) for word in words)
+        overrides = dict(word.removeprefix("+stored.").split("=", 1) for word in words)
         scores = _scores(json.loads(file.read_text(encoding="utf-8")))
-        rows.append({"corruption": said["data.corruption"], "strength": int(said["data.strength"]), **scores})
+        rows.append(
+            {
+                "corruption": overrides["data.corruption"],
+                "strength": int(overrides["data.strength"]),
+                **scores,
+            }
+        )
     return sorted(rows, key=lambda row: (CORRUPTIONS.index(row["corruption"]), row["strength"]))
 
 
@@ -340,9 +346,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Results on real handwritten digits.")
     parser.add_argument("task", choices=("train", "page"))
     parser.add_argument("root", type=Path)
-    given = parser.parse_args()
-    if given.task == "train":
-        train(given.root.resolve())
+    arguments = parser.parse_args()
+    if arguments.task == "train":
+        train(arguments.root.resolve())
     else:
         page()
 

@@ -656,8 +656,8 @@ class Mixture(Density):
                 break
         best = self.log_prob(value).argmax(0)
         index = best.reshape(1, *best.shape, *(1,) * len(self.event))
-        found = np.take_along_axis(value, np.broadcast_to(index, (1, *value.shape[1:])), 0)[0]
-        return wrap(found) if self.circular else found
+        mode = np.take_along_axis(value, np.broadcast_to(index, (1, *value.shape[1:])), 0)[0]
+        return wrap(mode) if self.circular else mode
 
     def mean(self) -> Array:
         if self.circular or not self.event:

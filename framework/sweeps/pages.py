@@ -295,9 +295,9 @@ def _notes(runs: Sequence[Mapping[str, Any]]) -> str:
             continue
         lines = text.splitlines()
         first = lines[: next((i for i, line in enumerate(lines) if line.startswith("run folder:")), 0)]
-        said = [line for line in first if not line.startswith(("threads:", "reads ", "samples:"))]
-        said += [line for line in lines if "warning" in line.lower()]
-        for line in dict.fromkeys(said):
+        notes = [line for line in first if not line.startswith(("threads:", "reads ", "samples:"))]
+        notes += [line for line in lines if "warning" in line.lower()]
+        for line in dict.fromkeys(notes):
             counts[line] = counts.get(line, 0) + 1
     lines = [
         f"{escape_unprintable(line, allowed='')}   ({count} of {len(runs)} runs)"

@@ -17,6 +17,7 @@ from framework.configuration.paths import FilePath
 from framework.data import Batch, Data, Splits
 from framework.datasets import given_images, images
 from framework.datasets.fields import FetchedInBatches, fetch
+from framework.errors import ConfigError
 from framework.target import Target
 from plugins.data.image_folder.corruption import Corrupted, Corruption
 from plugins.data.image_folder.labelled import LabelledImages, Loaded, find_folder
@@ -86,7 +87,10 @@ class ImageFolder(LabelledData):
         jitter: Largest share by which training images are shifted, scaled and made brighter or darker.
         corruption: Corruption of the test images: Gaussian noise, a Gaussian blur, less contrast, or JPEG compression;
             None for none.
-        strength: Strength of the corruption, as in ImageNet-C.
+        strength: Strength of the corruption, as in ImageNet-C; None: 3 if there is a corruption.
+
+    Raises:
+        ConfigError: A strength is given without a corruption.
     """
 
     bibtex = "image_folder, hendrycks2019benchmarking"
@@ -99,12 +103,17 @@ class ImageFolder(LabelledData):
         mirror: bool = False,
         jitter: Jitter = 0.08,
         corruption: Corruption | None = None,
-        strength: Annotated[int, Field(ge=1, le=5)] = 3,
+        strength: Annotated[int, Field(ge=1, le=5)] | None = None,
     ) -> None:
         super().__init__(root, labelled, jitter)
         self.mirror = mirror
         self.corruption: Corruption | None = corruption
-        self.strength = strength
+        if corruption is None and strength is not None:
+            raise ConfigError(
+                f"data.strength = {strength} has no effect without a corruption. Set data.corruption, or leave "
+                "data.strength out."
+            )
+        self.strength = 3 if strength is None else strength
 
     def prepare(self) -> None:
         loaded = self.labelled.load(

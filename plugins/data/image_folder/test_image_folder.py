@@ -19,7 +19,7 @@ from scipy.ndimage import gaussian_filter
 
 from framework.data import Batch, Data
 from framework.datasets.fields import fetch
-from framework.errors import DataError
+from framework.errors import DataError, UserError
 from framework.testing.data_samples import prepared
 from plugins.data.image_folder.corruption import CORRUPT, STRENGTHS
 from plugins.data.image_folder.data import keep_disc, turn
@@ -133,11 +133,12 @@ def test_a_packed_idx_file_cannot_fill_the_memory(tmp_path: Path) -> None:
         ({"classes": ["cat"]}, "images of 1 classes, but at least 2"),
         ({"validation": 0.5, "test": 0.5}, "must be less than 1"),
         ({"csv": "none.csv"}, "none.csv: no such file; expected a table with the columns `file` and `label`"),
+        ({"strength": 2}, "data.strength = 2 has no effect without a corruption"),
         ({"root": None}, "data.root is not set. Set data.root to a folder with the layout"),
     ],
 )
 def test_mistakes_in_settings_are_named(tmp_path: Path, settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(DataError, match=message):
+    with pytest.raises(UserError, match=message):
         prepared("image_folder", **{**write_folders(tmp_path), **SMALL, **settings})
 
 
