@@ -187,7 +187,7 @@ class Backbones(Encoder):
 
 
 class RawNetwork(nn.Module):
-    """Base class of a module other than `Model` that computes raw parameters from inputs, such as those of members.
+    """Base class of modules other than `Model` that compute raw parameters, such as the stacked members of an ensemble.
 
     A frozen predictor may compute it by other means than torch: its results must be a function of its inputs, and of
     the number of members that is its second argument.
@@ -295,13 +295,13 @@ def learns(predictor: Predictor) -> bool:
 def independent_penalty(values: Float[Tensor, "batch *member"]) -> Float[Tensor, "batch"]:
     """Return one penalty per sample, (batch,), with which each member of an ensemble trains as it would train alone.
 
-    The value is the mean over members, so it is comparable with the penalty of a single model. The gradient is that of
-    the sum over members, so the gradient of a member is neither divided by the number of members nor changed by other
-    members.
+    The value is the mean over members, so it is comparable with the penalty of a single model. Its gradient is the
+    gradient of the sum over members, so the gradient of a member is neither divided by the number of members nor
+    changed by other members.
 
     Args:
-        values: penalties of each sample and member, (batch, member). Those of a single model, (batch,), are returned
-            as they are.
+        values: penalties of each sample and member, (batch, member). Penalties of a single model, (batch,), are
+            returned unchanged.
     """
     if values.dim() == 1:
         return values

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from framework.errors import ConfigError, DataError, did_you_mean
 
 SLACK = 1e-3
-"""Largest difference of a vertex's sum of skinning weights from 1; beyond it the file is refused."""
+"""Largest accepted difference between 1 and the sum of a vertex's skinning weights."""
 ROUNDING = 1e-6
-"""Smallest difference of a sum of skinning weights from 1 at which the weights are divided by that sum."""
+"""Difference between 1 and a vertex's sum of weights from which on the weights are divided by this sum."""
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,8 @@ class Traits:
             factor 1/n in each column.
         products: (blend shape, column), true if the column is a factor of the blend shape's weight.
         projection: matrix from blend shapes to shape coefficients.
-        largest_error: largest distance of vertices of random bodies from those that `anny` computes itself, metres.
+        largest_error: largest distance, metres, between a vertex of a random body and the same vertex as `anny`
+            computes it.
     """
 
     labels: tuple[str, ...]
@@ -94,7 +95,7 @@ def interpolation(
     """Return the weights of linear interpolation: the sum of weight · anchor over the anchors is the value.
 
     Only the two anchors around a value have weights above 0, and the sum of the weights is 1. Values outside of the
-    range of the anchors are clamped to it. The anchors ascend.
+    range of the anchors are clamped to it. The anchors must be in ascending order.
     """
     values = values.clamp(anchors[0], anchors[-1])
     right = torch.searchsorted(anchors, values.contiguous()).clamp(1, len(anchors) - 1)

@@ -15,7 +15,7 @@ from framework.bodies.body import Body, BodyModel
 from framework.errors import DataError
 
 AGREEMENT = 1e-5
-"""Largest accepted distance, metres, of vertices of random bodies from those that `anny` computes itself."""
+"""Largest accepted distance, metres, between a vertex of a random body and the same vertex as `anny` computes it."""
 
 
 def extract(scratch: Path) -> tuple[Body, dict[str, np.ndarray]]:
@@ -74,7 +74,7 @@ def extract(scratch: Path) -> tuple[Body, dict[str, np.ndarray]]:
 
 @torch.no_grad()
 def largest_distance(model: anny.Anny, body: Body) -> float:
-    """Return the largest distance, metres, of a vertex of eight random bodies from the one that `anny` computes."""
+    """Return the largest distance, metres, between a vertex and the same vertex by `anny`, over eight random bodies."""
     random = np.random.default_rng(0)
     count, joints = 8, len(body.parents)
     traits = {label: torch.from_numpy(random.random(count)) for label in model.phenotype_labels}

@@ -12,11 +12,11 @@ from framework.bodies.body import Body, BodyModel
 from framework.errors import DataError
 
 OFF = 0.01
-"""Standard deviation, metres, of a mesh's vertices from those of the model, due to clothes, hair and registration."""
+"""Standard deviation, metres, of the distance between mesh and model, due to clothes, hair and registration."""
 INDEPENDENT = 35
-"""Number of vertex errors that count as independent in any mesh, since errors of vertices under one garment agree."""
+"""Number of vertex errors of a mesh that are treated as independent: vertices under one garment have similar errors."""
 BENT = 0.7
-"""Standard deviation of the angles of all joints except the root, radians, which spreads a bend over several joints."""
+"""Prior standard deviation, radians, of every joint except the root; the prior spreads a bend over several joints."""
 STEPS = 60
 ENOUGH = 1e-6
 """Step, metres and radians, below which the search ends."""

@@ -124,7 +124,7 @@ def _build_records(content: bytes) -> Any:
 
 
 def _obey(name: str, argument: Any, stack: list[Any]) -> None:
-    """Execute an instruction of a pickle; it must be one that changes nothing but the stack."""
+    """Execute an instruction that changes only the stack; other instructions are refused."""
     match name:
         case "MARK":
             stack.append(MARK)

@@ -120,7 +120,7 @@ _CONDITIONS = (
         for key in ("preset", "debug")
     ),
 )
-"""Conditions that the composed config decides; code that finds an idle setting later calls `runs.job.refuse_idle`."""
+"""Conditions on the composed config; code that detects an idle setting only later calls `runs.job.refuse_idle`."""
 
 
 def require_read(mode: str, overrides: Sequence[str]) -> None:

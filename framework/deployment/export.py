@@ -44,9 +44,9 @@ from framework.target import Target
 FORMAT = 1
 """Version of the layout of density.json."""
 PARITY = 1e-5
-"""Largest difference of a parameter of the density from the original model's, as a share of the parameter's largest."""
+"""Largest difference between the exported and the original model's parameters, as a share of the largest parameter."""
 DENSITY_PARITY = 1e-4
-"""Largest difference of log-densities from the original model's, as a share of max(1, |log-density|)."""
+"""Largest difference between the exported and the original log-densities, as a share of max(1, |log-density|)."""
 EXTRA = "pip install 'robust-visual-learning[export]'"
 SCRIPTS = ("predict", "serve")
 PACKAGE = exported_folder.__name__
@@ -147,7 +147,7 @@ class Exporting:
 
     @torch.no_grad()
     def form(self, arrays: Tensor, noise: Sequence[Tensor | None] | None = None) -> Exported:
-        """Return the parameters of these densities, computed with given random numbers (`given_draws`)."""
+        """Return the parameters of the original model's densities, computed with given random numbers."""
         with given_draws(noise):
             return exported(self.density(arrays))
 
@@ -273,7 +273,7 @@ class ModelNoise:
     dtype: torch.dtype
 
     def draw(self, count: int, seed: int) -> Tensor:
-        """Return such numbers for `count` inputs."""
+        """Return random numbers of this kind for `count` inputs."""
         shape = tuple(
             size if isinstance(size, int) else count * multiple_of_batch(size) for size in self.shape
         )
@@ -294,7 +294,7 @@ class ModelNoise:
 
 
 def multiple_of_batch(size: str) -> int:
-    """Return 50 for "50 * batch"."""
+    """Return the factor of the number of inputs in such a text: 50 for "50 * batch"."""
     return int(size.partition(" ")[0])
 
 

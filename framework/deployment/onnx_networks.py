@@ -15,7 +15,7 @@ from framework.model import Model, Predictor, RawNetwork
 PROBES = (1, 3)
 """Numbers of inputs for which a network of ONNX Runtime is compared with the original one."""
 AGREEMENT = 1e-5
-"""Largest difference of raw parameters from those of torch, as a share of max(1, the largest)."""
+"""Largest difference between the raw parameters of ONNX Runtime and of torch, as a share of max(1, the largest one)."""
 
 
 class OnnxNetwork(nn.Module):
@@ -46,7 +46,7 @@ class OnnxNetwork(nn.Module):
                     raise ArithmeticError
 
     def forward(self, inputs: Tensor, used: int | None = None) -> Tensor:
-        """Return the raw parameters; `used` is the number of members of which a `RawNetwork` returns those."""
+        """Return the raw parameters; with `used`, those of the first `used` members of a `RawNetwork`."""
         same = inputs.shape[1:] == self.shape and inputs.dtype == self.dtype and len(inputs)
         # ONNX Runtime may drop NaN in a maximum
         if not same or not math.isfinite(inputs.sum()):

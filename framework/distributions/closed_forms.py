@@ -245,7 +245,7 @@ def _quantile_in_trace(probability: Float[Tensor, "*shape"]) -> Float[Tensor, "*
 
 
 def _ratio(argument: Tensor, coefficients: tuple[tuple[float, ...], tuple[float, ...]]) -> Tensor:
-    """Return the ratio of two polynomials, whose coefficients begin with that of the highest power."""
+    """Return the ratio of two polynomials; the coefficients of each begin with the one of the highest power."""
     above, below = (torch.zeros_like(argument) for _ in range(2))
     for first, second in zip(*coefficients, strict=True):
         above, below = above * argument + first, below * argument + second

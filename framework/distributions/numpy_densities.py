@@ -67,8 +67,8 @@ class Density:
         circular: whether the target consists of angles.
         reach: distance from a peak, in widths of the peak, up to which the density of one number is integrated; larger
             for heavy tails.
-        by_draws: whether medians and intervals are those of DRAWS draws, because the densities of single angles are not
-            known.
+        by_draws: whether medians and intervals are estimated from DRAWS draws, because the densities of single angles
+            are not known.
     """
 
     batch: tuple[int, ...]
@@ -146,7 +146,7 @@ class Density:
         return self.mode()[None]
 
     def pick(self, index: Array, axis: int) -> "Density":
-        """Return densities chosen along a batch dimension; `index` replaces it and has the dimensions before it.
+        """Return the densities that `index` chooses along one batch dimension.
 
         Args:
             index: (*batch up to the dimension `axis`, count).
@@ -171,7 +171,7 @@ class Density:
     def nodes(self) -> tuple[Array, Array]:
         """Return quadrature points of one number, and the probability that each represents, both (point, *batch).
 
-        The points are those of Gauss's rule between the `edges`.
+        The points and probabilities follow Gauss's rule between the `edges`.
         """
         edges = self.edges()
         half = np.diff(edges, axis=0)[:, None] / 2
@@ -184,7 +184,7 @@ class Density:
     def edges(self) -> Array:
         """Return the ends of the panels of a quadrature of one number, ascending, (edge, *batch).
 
-        The ends are at distances from the peaks that grow by a constant factor; those of angles span the circle. The
+        The ends are at distances from the peaks that grow by a constant factor; the ends of angles span the circle. The
         distances from many peaks are rounded, so that few panels remain where peaks overlap.
         """
         place, width = self.peaks()

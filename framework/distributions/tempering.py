@@ -41,7 +41,7 @@ HELD = 0.3
 The peak is then found, and the grid is too coarse for p itself, but not necessarily for its power.
 """
 NARROWEST = 3.0
-"""Stretch of a stretched grid, in standard deviations of the power at its mode.
+"""Stretch s of the densest grid, in standard deviations of the power at its mode.
 
 For a stretch s, half of the grid's angles lie within 2 atan(s) of the mode.
 """
@@ -271,7 +271,7 @@ class CircularPower(Distribution):
         return angle, (arc.log() + math.log(step)).squeeze(-1).expand(angle.shape[:-1])
 
     def _narrow(self) -> Float[Tensor, "*batch 1"]:
-        """Return the stretch s that the grid needs, at most 1: its spacing at the mode, divided by equal spacing."""
+        """Return the stretch s that the grid needs, at most 1: its spacing at the mode, divided by the mean spacing."""
         # width of the normal density with the same height; p^(1/T) is √T times as wide
         width = (-self.density.log_prob(self.start).detach().double()).exp() / math.sqrt(2 * math.pi)
         width = width * self.temperature.detach().double().sqrt()

@@ -2,7 +2,7 @@
 
 The run times come from `run_times`, and the errors from `evaluate`, as in mode=work_precision. Every measurement that
 decides is repeated with the chosen setting, with other random numbers, before the setting is accepted. So no setting is
-chosen because it was lucky.
+chosen only because chance made its first measurement good.
 """
 
 import math

@@ -123,8 +123,8 @@ def tradeoff(
 ) -> Curve:
     """Measure metrics, errors against a reference, and run time of a trained predictor for each value of a knob.
 
-    Run times are those of the whole predictor, from input to log-likelihood, on the first batch. The predictor's mode,
-    its knob and the states of torch's random generators are restored afterwards.
+    Run times are measured for the whole predictor, from input to log-likelihood, on the first batch. The predictor's
+    mode, its knob and the states of torch's random generators are restored afterwards.
 
     Args:
         predictor: the trained predictor.

@@ -15,7 +15,7 @@ BELIEVED = 50.0
 CAUCHY = 3.0
 """Scale c of Cauchy's loss, in standard deviations of the noise.
 
-Residuals beyond it count less and less, so that an outlier has almost no influence.
+The larger a residual is beyond c, the less weight it has, so that an outlier has almost no influence.
 """
 FIRST = 8
 """Number of observed frames from which the start of the search is computed."""
@@ -28,7 +28,7 @@ class ObservedFrames(NamedTuple):
 
     Attributes:
         times: (flight, frame), s, not decreasing. A missing frame has the time at which it should have been observed.
-            All frames before the first observed one have the time of that one.
+            All frames before the first observed frame have the time of the first observed frame.
         places: positions of the ball, (flight, frame, 3), m, NaN if the frame is missing.
     """
 

@@ -1,8 +1,8 @@
 """The physics of a table-tennis ball: flight with drag, Magnus force and spin decay, and its bounce.
 
 Formulas are written over single components with arithmetic only, so that they serve both plain floats and batches of
-tensors. SciPy's solvers call them with floats a hundred thousand times, which is too often for the type checks that
-tests switch on. The estimation calls them with tensors. Units: metres, seconds, rad/s; z is up; y runs along the table.
+tensors. SciPy's solvers call them with floats a hundred thousand times; the type checks that tests switch on would take
+too long. The estimation calls them with tensors. Units: metres, seconds, rad/s; z is up; y runs along the table.
 """
 
 from dataclasses import dataclass
@@ -82,7 +82,7 @@ def slip(velocity: Vector, spin: Vector, radius: float) -> tuple[Any, Any]:
 def bounce(velocity: Vector, spin: Vector, constants: Constants) -> tuple[Vector, Vector]:
     """Return velocity and spin after an instantaneous bounce.
 
-    The model is that of Nakashima et al. (2010), for a hollow sphere, I = 2/3 m r². The table's friction stops the slip
+    The model follows Nakashima et al. (2010), for a hollow sphere, I = 2/3 m r². The table's friction stops the slip
     (the velocity of the contact point) if it can: this takes an impulse of 2/5 of the slip per unit of mass. Friction
     can give at most μ times the upward impulse (1 + e) |w|, where w is the vertical velocity before the bounce, e the
     restitution and μ the friction of `Constants`. If this is not enough, the ball goes on sliding.

@@ -252,7 +252,7 @@ def near_middle(
 def _lower_median(
     values: Float[Tensor, "batch points columns"],
 ) -> Float[Tensor, "batch 1 columns"]:
-    """Return the median over the points, the lower one of two, without NaN."""
+    """Return the median over the points, ignoring NaN; of two middle values, it is the lower one."""
     if not torch.compiler.is_exporting():
         return values.nanmedian(1, keepdim=True).values
     # ONNX has no such median

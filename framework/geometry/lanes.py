@@ -5,7 +5,7 @@ values. The position of a number in the vector is called a lane. `-`, `+`, `*`, 
 by lane on two values of one type. Vectors are LLVM's own, so that the compiler maps each to one, two or four registers
 of the processor. No function checks bounds.
 
-`no_type_check` keeps the type checks that tests switch on away from functions that numba calls while it compiles.
+The tests switch on type checks; `no_type_check` excludes functions that numba calls while it compiles.
 """
 
 import operator

@@ -1,4 +1,4 @@
-"""Parsers of mesh and cloud files, one function for each format; they never invent data that a file does not hold.
+"""Parsers of mesh and cloud files, one function for each format; they return only data that the file holds.
 
 Every parser takes the bytes of a file. If they are wrong, it raises a ValueError that says what it got, in which line,
 and what it expected; the caller, `geometry.meshes`, adds the name of the file. PLY has a module of its own. Comments
@@ -437,7 +437,7 @@ NO_NUMBER = re.compile(rb"[,;][ \t]*[,;]")
 
 
 def _blank_separated(content: bytes) -> bytes:
-    """Return the content of a cloud's text file with blanks as the only separators between the numbers.
+    """Return the content of a cloud's text file after replacing other separators between numbers by blanks.
 
     Raises:
         ValueError: a comma is the decimal sign, or a number is missing between two separators; the message names the

@@ -60,8 +60,8 @@ def require_trained(component: DensityHead) -> DensityHead:
     """Return the component itself if all its parameters are trained by gradient.
 
     Raises:
-        ConfigError: the component fits something after training, for which it would have to know which data belong to
-            it; or it requires backbones, which only the head of a model has; or it reads an image.
+        ConfigError: the component fits parameters after training, but it cannot know which samples belong to it; or it
+            requires backbones, which only the head of a model has; or it reads an image.
     """
     if len(component.raw_shape) != 1:
         raise ConfigError(

@@ -43,8 +43,8 @@ GOES_ON, LIMIT, STEP, COST, GRADIENT = 10, 0, 3, 2, 1
 def factorise(normal, fixed, damping, factor):
     """Fill `factor` with the lower Cholesky factor of `normal` + `damping` · identity, and return its smallest pivot.
 
-    Rows and columns of parameters that are `fixed` are replaced by those of the identity. The function returns NaN if
-    the matrix is not positive definite.
+    Rows and columns of parameters that are `fixed` are replaced by rows and columns of the identity matrix. The
+    function returns NaN if the matrix is not positive definite.
     """
     size = normal.shape[0]
     least = np.inf
@@ -244,7 +244,7 @@ def judge_steps(
 def invert(gram, inverse, trace):
     """Fill `inverse` with the inverse of each matrix in `gram`, and `trace` with the trace of an inverse.
 
-    The trace is that of the inverse of the matrix after its rows and columns were scaled to a diagonal of 1. It is NaN
+    For the trace, rows and columns of the matrix are first scaled so that its diagonal is 1. It is NaN
     if the matrix has no inverse.
     """
     count, size = gram.shape[0], gram.shape[1]

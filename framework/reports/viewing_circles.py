@@ -33,7 +33,7 @@ def choose(
 
     "certain" has samples whose density has one peak, an entropy of at most the median, and an error of at most π/6.
     "failed" has samples with one peak, such an entropy, but a larger error. "ambiguous" has samples with several peaks.
-    Of these samples, each row has those of lowest entropy. The choice is deterministic.
+    Each row shows the samples of lowest entropy among these. The choice is deterministic.
 
     Args:
         entropy: entropy of each density, nats.

@@ -110,7 +110,7 @@ def _fit_at_once(session: Session, run: Run) -> float:
 def _train_itself(session: Session, run: Run, wrapper: SelfTraining) -> float:
     """Let a wrapper train its models on the training and the validation split, and return the loss, nats.
 
-    The loss of a sample is that of models which were not trained on this sample.
+    The loss of a sample is computed by models that were not trained on this sample.
     """
     fed = _cache_features(session)
     front = session.predictor if isinstance(session.predictor, FrozenFrontEnd) else None

@@ -689,7 +689,7 @@ def keep_memory() -> None:
 
 
 def silence_lightning() -> None:
-    """Silence messages of Lightning that do not help the user, on missing hardware and on Lightning's deprecations."""
+    """Silence messages of Lightning about missing hardware and its own deprecations, which do not help the user."""
     for name in ("pytorch_lightning", "lightning_fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", message=".*LeafSpec", module="pytorch_lightning")

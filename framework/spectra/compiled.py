@@ -1,6 +1,6 @@
 """Residuals of Lorentzian lines for many Z-spectra, summed on one CPU core; compiled functions on NumPy arrays.
 
-Formulas and the order of the parameters are those of spectrum.py. All functions share the names of these arrays:
+spectrum.py describes the formulas and the order of the parameters. All functions share the names of these arrays:
     parameters: (spectrum, p) float64, of the preset "ten" or "fifteen".
     rows: (spectrum,) int64, row of each spectrum in `measured`.
     measured: (row, offset) float64, NaN where nothing was measured.

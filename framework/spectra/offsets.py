@@ -17,7 +17,7 @@ OFFSETS = (
     4.7984, 4.8984, 4.9985, 5.0986, 5.1987, 5.2987, 6.2494, 7.9981, 11.9985, 19.9991, 29.9986, 39.9982,
 )
 # fmt: on
-"""Offsets in ppm, those of the spectra of the human brain at 7 T published with CESTEval (V. Khlebnikov, MIT)."""
+"""Offsets, ppm, of the spectra of the human brain at 7 T that were published with CESTEval (V. Khlebnikov, MIT)."""
 
 
 def offsets_of(configured: Sequence[float] | None) -> tuple[float, ...]:

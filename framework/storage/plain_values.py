@@ -20,7 +20,7 @@ DEEPEST, MOST_ITEMS = 64, 100_000
 
 
 class PlainLoader(yaml.SafeLoader):
-    """YAML loader that reads only decimal numbers as programs write them; 1_0, 0x10, 010 and 1:30 are text."""
+    """YAML loader that reads only plain decimal numbers as numbers; 1_0, 0x10, 010 and 1:30 are read as text."""
 
 
 PlainLoader.yaml_implicit_resolvers = {

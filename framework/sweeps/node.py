@@ -40,7 +40,7 @@ PATIENCE = 0.1
 
 
 def read_node(folder: Path, handle: str) -> dict[str, Any] | None:
-    """Return the state that the job `handle` has left in its folder; None if there is none, or another job's."""
+    """Return the state that the job `handle` has left in its folder; None if the folder has no state of this job."""
     try:
         state = read_json(folder / NODE, "the state of a job") if (folder / NODE).is_file() else {}
     except DataError:

@@ -100,7 +100,7 @@ async def _read(request: Request) -> bytes:
 
 
 def read_npy(content: bytes) -> Any:
-    """Return the array of a .npy file without a copy; the file's own statement of its size allocates nothing.
+    """Return the array of a .npy file without a copy; no memory is allocated for a size that the file only states.
 
     Raises:
         ValueError: the content is no .npy file of numbers, or is cut off.

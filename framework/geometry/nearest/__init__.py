@@ -133,7 +133,7 @@ def nearest(
 
 
 def nearest_in_trace(clouds: Tensor, queries: Tensor, sizes: Tensor | None) -> Nearest:
-    """Return what `nearest` returns, by operations of which every one has a form in ONNX.
+    """Return the same as `nearest`, computed only by operations that exist in ONNX.
 
     The squared distance |x|² - 2 x·q + |q|² is computed in float64 as products of matrices, so that the distance of
     points in the unit ball is exact to 1e-7. Few queries at a time keep the products in a CPU's cache.

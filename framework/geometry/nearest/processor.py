@@ -42,7 +42,7 @@ QUERY_COUNT = 17
 LARGE = 2**15
 """Number of points or queries from which several threads work on one cloud."""
 TURNS = 16
-"""Number of parts into which each thread's share of the work is cut, so that all threads end at about the same time."""
+"""Number of parts into which the work of each thread is divided, so that all threads end at about the same time."""
 AT_ONCE = 2**24
 """Number of points and queries of one call of compiled code, which takes some tenths of a second.
 
@@ -245,7 +245,7 @@ KEPT = 2**20
 
 
 class Desks(local):
-    """Working memory of each thread, kept between searches, since to allocate it takes a large share of their time."""
+    """Working memory of each thread, kept between searches, because allocating it takes a large share of their time."""
 
     def __init__(self) -> None:
         self.cached: dict[tuple[int, int, np.dtype, int], tuple[Bench, Packed, Packed]] = {}

@@ -7,7 +7,7 @@ queries need a child, each of these queries continues alone, and is compared wit
 first guesses are the nearest points of the previous sixteen queries, or points found by `descend` in a large cloud.
 
 No tolerance is needed. A box's squared distance is computed by the same operations as a point's, and each of these
-rounds monotonically. So the rounded distance of a box is not larger than that of any point in it.
+rounds monotonically. So the rounded distance of a box is not larger than the rounded distance of any point in the box.
 
 Of points at the same distance, the one with the lowest id is returned. If a query meets its smallest squared distance a
 second time, at a point or a box, it searches all points at this distance (`lowest_id`).

@@ -51,7 +51,7 @@ class Stream:
         """Search one more chunk.
 
         Raises:
-            DataError: as `nearest`, or the number of columns differs from that of the first chunk; the results so far
+            DataError: as `nearest`, or the chunk has another number of columns than the first one; the results so far
                 are then unchanged.
         """
         chunk = chunk.detach()

@@ -12,7 +12,7 @@ from framework.target import Target
 class Example(Mean):
     """Mean over samples of the largest absolute error of a sample's numbers, in the unit of the target.
 
-    The error is that of the point prediction. The metric also returns the standard error of this mean.
+    The metric evaluates the point prediction. It also returns the standard error of this mean.
 
     Raises:
         ConfigError: the target is not real-valued.

@@ -220,9 +220,10 @@ class CEST(Data, Mapped):
     def augment(self, batch: Batch) -> Batch:
         """Return a batch with random noise, and with fitted lines that are shifted along the offsets at random.
 
-        The shift is that of the B0 field. A spectrum is the sum of its fitted lines and of the residuals of the fit;
-        the residuals are not shifted. The shift and the standard deviation of the noise are their largest values times
-        the cube of a uniform random number, so that most spectra stay nearly unchanged and some change strongly.
+        The shift imitates an error of the B0 field. A spectrum is the sum of its fitted lines and of the residuals of
+        the fit; the residuals are not shifted. The shift and the standard deviation of the noise are their largest
+        values times the cube of a uniform random number, so that most spectra stay nearly unchanged and some change
+        strongly.
         """
         spectra, target, lines = batch["input"], batch["target"], batch["lines"]
         if self.shift:

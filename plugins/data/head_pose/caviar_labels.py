@@ -67,7 +67,7 @@ def _label(file: Path, position: str, entry: Any) -> Label:
 def write_labels(file: Path, labels: Mapping[str, Sequence[Label]], side: int) -> None:
     """Write a label file in the published layout; the same labels give the same bytes.
 
-    The fields x, y and size of each label are those of a head that fills an image of `side` × `side` pixels.
+    The fields x, y and size of each label describe a head that fills an image of `side` × `side` pixels.
     """
     content = {}
     for split, labels_of_split in labels.items():

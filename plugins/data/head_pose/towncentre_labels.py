@@ -76,7 +76,7 @@ def read_label(file: Path) -> tuple[float, bool]:
     """Return the pan in degrees, and whether the head is marked as valid.
 
     Raises:
-        DataError: The file cannot be read, or its lines are not those of a label.
+        DataError: The file cannot be read, or has other lines than a label.
     """
     with translate_errors(file, "a label"):
         text = decode(read_bytes(file))

@@ -119,7 +119,7 @@ def _parts(body: Body, where: Skeleton) -> dict[str, list[int]]:
 def _along(body: Body, chain: list[tuple[int, int]], share: np.ndarray) -> Float[np.ndarray, "vertex"]:
     """Return each vertex's distance, metres, from the first joint of a limb, measured along the bones of the limb.
 
-    For each vertex the limb is that of the body side on which the vertex lies.
+    The limb is the left or the right one, depending on the side of the body on which the vertex lies.
 
     Args:
         body: the body.

@@ -100,7 +100,7 @@ def render_animation(
 ) -> list[Image.Image]:
     """Return the frames of the animation.
 
-    The arguments are those of the command; `paths` is the argument of the same name of `framework.load`.
+    The command has the same arguments; `paths` is passed to `framework.load`.
     """
     description, _ = read_stored(run, paths=paths)
     data: HumanScans = training_data(description, "human_scans")

@@ -55,7 +55,7 @@ class Actor:
 class Generated:
     """Person of a generated data set, who can take any pose.
 
-    The registered mesh is that of the data set, brought into each pose: its distances from the bare body and its
+    The registered mesh comes from the data set and is brought into each pose; its distances from the bare body and its
     colours do not change. The scan is generated anew in each pose, with the same clothes, hair and light, and with the
     shading of the pose.
 

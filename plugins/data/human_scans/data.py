@@ -163,7 +163,7 @@ class HumanScans(Data, SubjectFolder):
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         """Return one sample for each coloured mesh and each of its cameras.
 
-        The cameras of a mesh are those of a file cameras.json in the same folder. Without such a file there is one
+        The cameras of a mesh are read from the file cameras.json in the same folder. Without such a file there is one
         camera, which sees the whole mesh from the front.
         """
         if not files:

@@ -173,7 +173,7 @@ def _curtain(
 def _tail(
     middle: np.ndarray, half: np.ndarray, random: Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a tail that leaves the back of the head and hangs down; arguments and results are those of `_curtain`."""
+    """Return a tail that hangs down from the back of the head; arguments and results as for `_curtain`."""
     length, thick, high = random.uniform(0.18, 0.36), random.uniform(0.022, 0.034), random.uniform(-0.1, 0.5)
     angle, down = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, 1, 48))
     radius = thick * (0.45 + 1.1 * np.sqrt(down.clip(0, 1))) * np.sqrt((1 - down).clip(0.002, None)) * 1.35
@@ -194,7 +194,7 @@ def _tail(
 def _bun(
     middle: np.ndarray, half: np.ndarray, random: Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a bun, a ball at the back or on top of the head; arguments and results are those of `_curtain`."""
+    """Return a bun, a ball at the back or on top of the head; arguments and results as for `_curtain`."""
     size, lift = random.uniform(0.032, 0.05), random.uniform(0.2, 1.3)
     angle, down = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, np.pi, 32))
     radius = size * (1 + 0.07 * np.sin(5 * angle + 6 * down))

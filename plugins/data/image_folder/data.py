@@ -50,7 +50,7 @@ class LabelledData(Data):
     _splits: Splits
 
     def _keep(self, loaded: Loaded) -> None:
-        """Keep what is known of the images."""
+        """Store name, sizes, digest and remarks of the loaded images as attributes."""
         self.title = find_folder(self.root).resolve().name
         self.skipped, self.remarks = loaded.skipped, loaded.remarks
         self._digest = loaded.digest
@@ -77,7 +77,7 @@ class LabelledData(Data):
 
 
 class ImageFolder(LabelledData):
-    """A user's own images with classes: folders named by class, a table of labels, or idx files as those of MNIST.
+    """A user's own images with classes: folders named by class, a table of labels, or idx files (the format of MNIST).
 
     Args:
         root: Folder of the images. It holds folders that are named by class, perhaps within folders train, validation

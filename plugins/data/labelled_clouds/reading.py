@@ -46,8 +46,8 @@ class Reading:
     Attributes:
         points: Number of points drawn from the surface of a mesh (None: 2048), and largest number of points read of a
             cloud (None: all).
-        columns: Attributes in addition to x, y, z. The normals of a mesh are those of its faces; its other attributes
-            are interpolated.
+        columns: Attributes in addition to x, y, z. The normals of points of a mesh are the normals of its faces; its
+            other attributes are interpolated.
         seed: Seed of the random points, which depend only on the seed and on the name of the file.
         centred: Whether to subtract each cloud's mean before it is rounded to float32.
         surface: Whether files without faces are refused.

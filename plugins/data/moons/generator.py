@@ -3,8 +3,8 @@
 Class 0 is the upper half of a unit circle about (0, 0), class 1 the lower half of a unit circle about (1, ½). A point
 lies at a uniformly distributed angle of the arc of its class, plus normal noise. Points are in standard units: the mean
 of each coordinate is subtracted, and the difference is divided by the coordinate's standard deviation. Mean and
-standard deviation are those of the distribution and not of a sample. In these units, reflection through the origin maps
-the arc and the density of each class to those of the other class.
+standard deviation belong to the distribution, not to a sample. In these units, reflection through the origin maps the
+arc and the density of each class to those of the other class.
 """
 
 import math

@@ -221,7 +221,7 @@ class Pascal3D(Data):
     def _read(self, samples: Mapping[str, Sequence[Sample]], faults: Sequence[DataError]) -> None:
         """Read the crops of all splits.
 
-        One error names all files that cannot be read: those of `faults` and those of the crops.
+        One error names all files that cannot be read: the annotation files in `faults`, and the images of the crops.
         """
         self._tables, self.skipped = images.load_splits(
             {

@@ -124,7 +124,7 @@ def _save(part: Path, folder: str, name: str, shot: Shot) -> None:
 def _objects(shot: Shot) -> np.ndarray:
     """Return the struct array `record.objects` of an annotation file.
 
-    Its fields are those of the official files, and the fields `symmetry` and `blur`, which official files do not have.
+    It has all fields of the official files, and in addition the fields `symmetry` and `blur`.
     """
     entries = [
         {

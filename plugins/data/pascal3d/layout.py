@@ -80,8 +80,8 @@ def check_root(root: Path, category: str) -> None:
 def split_lists(category: str) -> dict[str, list[tuple[str, Path]]]:
     """Return the lists of images of each split, each with its source ("pascal" or "imagenet").
 
-    "train" has the training images of VOC and all images of ImageNet; "test" has the validation images of VOC. The
-    protocol is that of Tulsiani & Malik (CVPR 2015) and of Su et al. (ICCV 2015), thesis §3.6.1.
+    "train" has the training images of VOC and all images of ImageNet; "test" has the validation images of VOC. This is
+    the protocol of Tulsiani & Malik (CVPR 2015) and of Su et al. (ICCV 2015), thesis §3.6.1.
     """
     return {
         "train": [

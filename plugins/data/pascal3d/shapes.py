@@ -1,6 +1,6 @@
 """Coloured bodies of closed solids, from which the object families are built.
 
-Object coordinates are those of PASCAL3D+ models: the front faces -y, z points up, and x to the left of the object.
+Objects have the coordinates of PASCAL3D+ models: the front faces -y, z points up, and x to the left of the object.
 """
 
 from dataclasses import dataclass

@@ -98,7 +98,7 @@ def _damped_oscillation(z: Any, speed: Any, fall: Any, rate: Any, damping: Any) 
 
 
 def _push(z: Any, speed: Any, rate: Any, damping: Any) -> Any:
-    """Return the upward push of the table per mass, -Ω² z - 2 ζ Ω z', before it is clipped at 0.
+    """Return the upward push of the table per unit of mass, -Ω² z - 2 ζ Ω z', before it is clipped at 0.
 
     The arguments are those of `_damped_oscillation`.
     """
@@ -126,7 +126,7 @@ def _first_root(value: Callable[[Any], Any], scale: Any, longest: Any) -> Any | 
 def _end_of_loose(z: Any, speed: Any, fall: Any, rate: Any, damping: Any) -> Any:
     """Return when a ball that is inside the table and not pushed by it leaves the table or is pushed again.
 
-    The arguments are those of `_damped_oscillation`; the state is that at time 0.
+    The arguments are as for `_damped_oscillation`; they describe the state at time 0.
     """
     discriminant = speed**2 + 2 * fall * z
     leaves = (speed - mpmath.sqrt(discriminant)) / fall if discriminant >= 0 else None

@@ -45,7 +45,7 @@ MANY_LABELS = 20
 
 
 class Question(NamedTuple):
-    """Settings that determine how a table is read; their names and meanings are those of `Tabular`'s arguments."""
+    """Settings that determine how a table is read; names and meanings as for the arguments of `Tabular`."""
 
     target: tuple[str, ...]
     kind: Kind

@@ -58,13 +58,14 @@ class BallisticHead(DensityHead, Fitted):
     gradient of the density with respect to the input is set to 0.
 
     Args:
-        observed, step: number of observed frames, and time between frames in seconds; equal to those of the data.
+        observed, step: number of observed frames, and time between frames in seconds; the same values as in the config
+            of the data.
         density: method by which the state's uncertainty is propagated.
         samples: number of sampled flights in the mixture; may be set at any time.
         spin: prior standard deviation of each component of the spin, rad/s.
         noise: standard deviation of a coordinate, m; initial value of `fit`.
         steps: largest number of steps of the search for a state; real flights take about ten.
-        identify: whether `fit` identifies the constants; otherwise those of the config are used.
+        identify: whether `fit` identifies the constants; otherwise the constants of the config are used.
         constants: constants of the ball and the table; initial values of `fit`.
     """
 

@@ -13,7 +13,7 @@ from framework.flights.trajectories import simulate, simulate_with_jacobian
 FITTED = ("drag", "lift", "restitution", "friction", "surface")
 """Names of the constants that `identify` fits."""
 LOW, HIGH = (0.0, -0.02, 0.3, 0.0, -0.3), (1.0, 0.02, 1.0, 1.0, 0.3)
-"""Bounds of the constants in `FITTED`; those of the surface are metres above its value in the config."""
+"""Bounds of the constants in `FITTED`; the bounds of the surface are metres above its value in the config."""
 SIZES = (0.05, 0.002, 0.05, 0.05, 0.01)
 """Typical step size of each constant."""
 ROUNDS = 40
@@ -38,7 +38,7 @@ def fitted_constants(constants: Constants) -> Float[Tensor, "constant"]:
 def constant_bounds(constants: Constants) -> tuple[Float[Tensor, "constant"], Float[Tensor, "constant"]]:
     """Return lower and upper bounds that stored values of `FITTED` must satisfy.
 
-    They are the bounds of `identify`, extended to the values in `constants` (those of the config) if these lie outside.
+    They are the bounds of `identify`, extended to the values of the config (`constants`) if these lie outside.
     """
     values = fitted_constants(constants)
     middle = torch.zeros_like(values)

@@ -20,13 +20,13 @@ LARGEST_LOG_UNIT = 20.0
 
 
 class HybridHead(DensityHead):
-    """A learned density around a mean that the encoder gives, such as that of a physical model.
+    """A learned density around a mean that the encoder gives, such as the prediction of a physical model.
 
     The features that the head reads begin with the mean, in the target's unit and order. Then follows one number for
     each number of the target: the logarithm of the unit in which the component describes the distance of the target
     from the mean. A network of two hidden layers reads all features and predicts the raw parameters of the component.
     Unless the component has trained parameters of its own, the last layer of the network starts at 0, so that at first
-    the mean is that of the encoder alone.
+    the mean is the encoder's mean.
 
     Args:
         further: number of features of the encoder beside the mean and the units.
@@ -70,7 +70,7 @@ class HybridHead(DensityHead):
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
         """Return the component's loss for (target - location) / scale, plus Σ log scale, nats (change of variables).
 
-        Location and scale are those of `_read`.
+        `_read` returns location and scale.
         """
         numbers, location, scale = self._read(raw)
         return self.component.loss(numbers, (target - location) / scale) + scale.log().sum(-1)
@@ -78,8 +78,8 @@ class HybridHead(DensityHead):
     def _read(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the component's raw parameters, and the location and scale of the affine transform of its density.
 
-        Location and scale are (*batch, number). The head's density is that of location + scale · x for x from the
-        component.
+        Location and scale are (*batch, number). The head returns the density of location + scale · x, where x has the
+        component's density.
         """
         raw = require_finite(raw, self.size)
         weight = self.network[-1].weight

@@ -144,5 +144,5 @@ class LaplaceImageHead(DensityHead):
 
 
 def coloured(image: Float[Tensor, "*batch number"]) -> Bool[Tensor, "*batch 1"]:
-    """Return a mask of the pixels that are not white, those of which an 8-bit file stores a channel below 1."""
+    """Return a mask of the pixels that are not white: an 8-bit file stores at least one of their channels below 1."""
     return (image < WHITE).any(-1, keepdim=True)

@@ -140,8 +140,8 @@ class LatentDensity(Distribution):
     `log_prob` is the logarithm of the mean of importance weights at random values of z. These values are sampled once,
     so that log_prob is a fixed function of φ. Its expectation over the values of z is below the true log-density and
     rises towards it with their number. With a tolerance, the number of values of z is doubled for each φ until the
-    estimated error is below the tolerance.
-    `sample` draws a new z for every value. `entropy`, `mode`, `median` and `marginal` are those of `mixture`.
+    estimated error is below the tolerance. `sample` draws a new z for every value. `entropy`, `mode`, `median` and
+    `marginal` are computed from `mixture`.
     """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
@@ -220,7 +220,7 @@ def _(density: LatentDensity, value: Tensor) -> Estimate:
 
 
 def _register_mixture(function: Any) -> None:
-    """Register a function of a density as that of the mixture of the drawn components."""
+    """Register a function of the protocol for `LatentDensity`: apply it to the mixture of the sampled components."""
 
     @function.register
     def _(density: LatentDensity, *arguments: Any) -> Any:
@@ -238,7 +238,7 @@ def _(density: LatentDensity) -> Distribution:
 
 @exported.register
 def _(density: LatentDensity) -> Exported:
-    """Return the mixture of the drawn components: log-densities of an exported model are those of this mixture."""
+    """Return the mixture of the sampled components; an exported model computes log-densities from this mixture."""
     remark = (
         f"Log-densities are those of a mixture of {density.effort.samples} components at random latent vectors from "
         "the prior; the original model estimates them by importance sampling or to a tolerance."

@@ -59,9 +59,9 @@ def _log_integral(
 ) -> Tensor:
     """Return the log of the density of one angle, without the factor 1/k(λ): the integral over the other two angles.
 
-    `index` says which angle it is, as in `log_marginal`; `left`, `right` and `falls` are those of its `frame`. The
-    integral over the third angle is a Bessel function. The integral over the second one is a quadrature with `count`
-    fixed nodes or, if `count` is None, with nodes around the peaks.
+    `index` says which angle it is, as in `log_marginal`; `left`, `right` and `falls` are attributes of the argument
+    `frame` of `log_marginal`. The integral over the third angle is a Bessel function. The integral over the second one
+    is a quadrature with `count` fixed nodes or, if `count` is None, with nodes around the peaks.
     """
     around = index == 1  # quadrature runs over the azimuth then, otherwise over the elevation
     log_density = _log_density(angle, left, right, falls, index)

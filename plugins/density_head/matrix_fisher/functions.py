@@ -300,8 +300,8 @@ def _series(name: str, concentration: Tensor) -> Tensor:
 def _coefficients(terms: int = 20) -> dict[str, list[float]]:
     """Return the coefficients of the asymptotic series in 1/κ of E sin²φ and E sin⁴φ, by name.
 
-    2φ has a von Mises density with the concentration κ around 0. The series follow from that of A = I₁(κ)/I₀(κ), which
-    solves A' = 1 - A² - A/κ (Mardia & Jupp 2000, A.14).
+    2φ has a von Mises density with the concentration κ around 0. The series follow from the series of A = I₁(κ)/I₀(κ),
+    which solves A' = 1 - A² - A/κ (Mardia & Jupp 2000, A.14).
     """
     ratio = [Fraction(1)]
     for order in range(1, terms):
@@ -317,7 +317,7 @@ def _coefficients(terms: int = 20) -> dict[str, list[float]]:
 class _LogProb(Function):
     """Autograd function of the log-density.
 
-    The derivative with respect to F is R - E R. The derivative with respect to the quaternion is that of -Σ λᵢqᵢ².
+    The derivative with respect to F is R - E R. Of the terms, only -Σ λᵢqᵢ² depends on the quaternion.
     """
 
     @staticmethod

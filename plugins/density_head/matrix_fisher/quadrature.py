@@ -136,7 +136,7 @@ def _refine(
 def _half(length: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
     """Return the distances of nodes on one side of a peak, in [0, length], and their weights.
 
-    They are those of Gauss-Legendre quadrature in y, where the distance is width · sinh y.
+    The quadrature is Gauss-Legendre quadrature in y; the distance of a node is width · sinh y.
     """
     ends = [
         torch.asinh(torch.minimum(length / width, torch.full_like(length, NEAR))),

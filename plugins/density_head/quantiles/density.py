@@ -65,7 +65,7 @@ class PiecewiseQuantiles(Distribution):
 
     @cached_property
     def _log_heights(self) -> Float[Tensor, "*batch piece"]:
-        """Log-density between each two quantiles, nats."""
+        """Log-density between neighbouring quantiles, nats."""
         return self.probabilities.diff().log() - self.steps.log()
 
     @cached_property
@@ -92,7 +92,7 @@ class PiecewiseQuantiles(Distribution):
         return torch.where((piece == 0) | (piece == last), tails, inner)
 
     def _fall(self, distance: Tensor) -> Tensor:
-        """Return how much lower than at its begin the log-density of a tail is at a distance, in scales."""
+        """Return by how much the log-density of a tail falls from its beginning to `distance` (unit: its scale)."""
         if self.tail == 0:
             return distance
         return (1 + 1 / self.tail) * torch.log1p(self.tail * distance)
@@ -115,7 +115,7 @@ class PiecewiseQuantiles(Distribution):
         return torch.where(piece == 0, below, torch.where(piece == last, 1 - above, inner))
 
     def _survival(self, distance: Tensor) -> Tensor:
-        """Return the share of a tail that lies beyond a distance from its begin, in scales."""
+        """Return the share of a tail that lies beyond `distance` from its beginning (unit: its scale)."""
         if self.tail == 0:
             return torch.exp(-distance)
         return torch.exp(-torch.log1p(self.tail * distance) / self.tail)
@@ -139,7 +139,7 @@ class PiecewiseQuantiles(Distribution):
         return torch.where(piece == 0, lower, torch.where(piece == last, upper, inner))
 
     def _distance(self, share: Tensor) -> Tensor:
-        """Return the distance from the begin of a tail beyond which a share of it lies, in scales."""
+        """Return the distance from the beginning of a tail (unit: its scale) beyond which `share` of it lies."""
         return -share.log() if self.tail == 0 else torch.expm1(-self.tail * share.log()) / self.tail
 
     def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
@@ -262,22 +262,23 @@ def _(density: PiecewiseQuantiles, value: Tensor) -> Tensor:
 
 
 def _squares(first: Tensor, then: Tensor, length: Tensor) -> Tensor:
-    """Return the integral of the square of a linear function from `first` to `then` over a length."""
+    """Return the integral of the square of a linear function, which runs from `first` to `then`, over `length`."""
     return length * (first.square() + first * then + then.square()) / 3
 
 
 def _tail_score(density: PiecewiseQuantiles, outside: Tensor, share: Tensor) -> Tensor:
-    """Return the part of the score over a tail with a probability `share`, in scales.
+    """Return the part of the score that comes from a tail with the probability `share`, in units of its scale.
 
     Args:
         density: the density.
-        outside: distance of the target from the begin of the tail, in scales; 0 if the target is not in the tail.
+        outside: distance of the target from the beginning of the tail, in units of its scale; 0 if the target is not in
+            the tail.
         share: probability of the tail.
     """
     shape = density.tail
 
     def beyond(power: int) -> Tensor:
-        """Return the integral of the survival function to a power from `outside` to infinity."""
+        """Return the integral, from `outside` to infinity, of the survival function raised to a power."""
         if shape == 0:
             return torch.exp(-power * outside) / power
         return torch.exp((1 - power / shape) * torch.log1p(shape * outside)) / (power - shape)

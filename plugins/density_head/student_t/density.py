@@ -21,7 +21,7 @@ from plugins.density_head.student_t.functions import (
 )
 
 FEW = 64
-"""Number of elements below which SciPy computes distribution functions; of more, a sum takes a tenth of the time."""
+"""Number of elements below which SciPy computes distribution functions; for more, a sum takes a tenth of its time."""
 MOST_TERMS = 40
 """Largest whole degrees of freedom for which the distribution function is computed as a sum."""
 RARE = 1e-6
@@ -122,7 +122,7 @@ class StudentT(Symmetric):
 
 
 def _apply_scipy(name: str, freedom: Tensor, argument: Tensor) -> Tensor:
-    """Return a function of `scipy.special` with the arguments ν and `argument`, float64; torch has none of them."""
+    """Return a function of `scipy.special`, which torch lacks, with the arguments ν and `argument`, float64."""
     # imported here, since importing SciPy is slow and most commands do not need it
     from scipy import special
 

@@ -15,7 +15,7 @@ FAR = 1e4
 def log_gamma_step(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Return log Γ(x + ½) - log Γ(x) - ½ log x for x > 0, float64; it goes to 0 as x grows.
 
-    The series is that of Tricomi & Erdélyi 1951, eq. 1, with its logarithm taken.
+    For large x it is the logarithm of the series of Tricomi & Erdélyi 1951, eq. 1.
     """
     x = x.double()
     small, inverse = x.clamp(max=SERIES), x.clamp(min=SERIES).reciprocal()

@@ -38,10 +38,10 @@ class ExtraTreesHead(DensityHead, Fitted):
 
     Classes: p_k = (T f_k + a) / (T + a K) for K classes and T trees, where f_k is the share of class k in a sample's
     leaf, averaged over the trees, and a is `smoothing`. This is Laplace's rule on T votes: no class has probability 0,
-    and the order of the classes is that of f_k. Reals: a mixture with one normal density around the mean of each tree,
-    with one width for each number of the target. After the fit the width is the standard deviation of the training
-    targets; `calibrate` fits it to the validation split by maximum likelihood. The output of the trees is piecewise
-    constant in the features, and its gradient is 0.
+    and the classes keep the order of f_k. Reals: a mixture with one normal density around the mean of each
+    tree, with one width for each number of the target. After the fit the width is the standard deviation of the
+    training targets; `calibrate` fits it to the validation split by maximum likelihood. The output of the trees is
+    piecewise constant in the features, and its gradient is 0.
 
     The forest is stored as flat arrays of integers and thresholds; scikit-learn grows it and is not needed to use it.
 

@@ -58,11 +58,11 @@ class Floored(Distribution):
 
     @property
     def mode(self) -> Tensor:
-        """Value of highest density, which is that of p."""
+        """Value of highest density; it is the mode of p."""
         return self.density.mode
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
-        """Return every class, as `enumerate_support` of the density p does."""
+        """Return every class, (class, *batch); without `expand`, all dimensions after the first have length 1."""
         return self.density.enumerate_support(expand)
 
     def log_prob(self, value: Tensor) -> Tensor:

@@ -31,7 +31,7 @@ BORDERS: tuple[float, ...] = tuple(_ARRAYS["borders"].tolist())
 CHAINS: dict[str, tuple[tuple[float, ...], ...]] = {
     name: tuple(map(tuple, array.tolist())) for name, array in _read("chain/").items()
 }
-"""Coefficients of the polynomials on the pieces between BORDERS, by function: row j holds those of y^j.
+"""Coefficients of the polynomials on the pieces between BORDERS, by function: row j holds the coefficients of y^j.
 
 They are Python numbers, because a compiler writes them into its code.
 """

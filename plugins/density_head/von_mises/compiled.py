@@ -181,8 +181,8 @@ def _parts(value, mean, concentration) -> Any:
     """Return the terms of log p, and of its derivatives, for one element.
 
     Returns:
-        The log-density at the mean; sin(φ-μ); 1 - cos(φ-μ); 1 - A(κ); and 1 if the element must be computed otherwise,
-        or else 0: φ-μ is beyond the reach of the reduction, or an argument is NaN, or κ < 0.
+        The log-density at the mean; sin(φ-μ); 1 - cos(φ-μ); 1 - A(κ); and 1 if other code must compute the element, or
+        else 0: φ-μ is beyond the reach of the reduction, or an argument is NaN, or κ < 0.
     """
 
 
@@ -235,7 +235,7 @@ def _(value, mean, concentration):
 @compiled
 @no_type_check
 def log_prob(value, mean, concentration, result):
-    """Fill `result` with log p, nats; return 0, or another number if an element must be computed otherwise."""
+    """Fill `result` with log p, nats; return 0, or another number if other code must compute an element."""
     use_widest_registers()
     lost = 0
     for i in range(len(result)):

@@ -32,7 +32,7 @@ from plugins.density_head.von_mises.processor import is_transformed
 LARGEST = {torch.float32: torch.finfo(torch.float32).max, torch.float64: 1e300}
 """Largest κ of each dtype; a larger κ is replaced by it, so that all results stay finite numbers.
 
-At this κ the density is a point mass in all but its height.
+A density with this κ differs from a point mass only by its finite height.
 """
 
 

@@ -73,7 +73,7 @@ class VonMisesHead(DensityHead):
         return VonMises(mean, self.concentration.to(mean).expand_as(mean))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return the negative log-likelihood of each sample, nats; with `concentration="fixed"` that for κ = 1."""
+        """Return the negative log-likelihood of each sample, nats; with `concentration="fixed"` it uses κ = 1."""
         density = self(raw)
         if not self.predicted:  # the cosine loss does not change with calibration
             density = VonMises(density.mean, torch.ones_like(density.mean))

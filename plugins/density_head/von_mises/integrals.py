@@ -106,8 +106,9 @@ def half_width(mass: Tensor, concentration: Tensor) -> Tensor:
 def mass_above(value: Tensor, mean: Tensor, concentration: Tensor, equal: float) -> tuple[Tensor, Tensor]:
     """Return the probability of all angles that are denser than `value`, and of all that are at least as dense.
 
-    These angles form an arc around the mean. Its ends are where the logarithm of the density is above, or below, that
-    at `value` by `equal`, so that the two probabilities are 0 and 1 for the uniform density. Both are float64.
+    These angles form an arc around the mean. At the ends of the two arcs, the log-density is higher, or lower, by
+    `equal` than the log-density at `value`. For the uniform density, the two probabilities are therefore 0 and 1. Both
+    are float64.
     """
     kappa = concentration.double()
     sine, cosine = half_angle(value.double(), mean.double())

@@ -96,7 +96,7 @@ def encode(
     *,
     rotation_invariant: bool = False,
 ) -> Encoding:
-    """Return the requested features: for each basis point, those of the nearest point of each cloud.
+    """Return, for each basis point, the requested features of the nearest point of each cloud.
 
     "distance" is the distance of the nearest point from the basis point (eq. 6.4). "delta" is the vector from the basis
     point to the nearest point (eq. 6.5). "color", "normal" or the name of a column are attributes of the nearest point,
@@ -155,7 +155,7 @@ def encode(
 
 
 def encode_distances(clouds: Tensor, basis: Basis) -> Float[Tensor, "batch k"] | None:
-    """Return the feature "distance" of clouds that are normalised to the unit ball, to the bit as `encode` does.
+    """Return the feature "distance" of clouds normalised to the unit ball, with the same bits as `encode`.
 
     For clouds with padding, attributes, a gradient or numbers that are not finite, and for clouds that are not float32
     or not on the CPU, the function returns None; the caller then uses `encode`. For one cloud of 2,048 points, the

@@ -1,1 +1,1 @@
-"""Normal scores of numbers beside the numbers themselves."""
+"""Encoder that appends the normal scores of numbers to the numbers."""

@@ -176,7 +176,7 @@ def load_faces(mesh: MeshSettings) -> Tensor:
     """Return the triangles of the mesh as vertex indices, (faces, 3).
 
     If `mesh.root` is set, they are read from the registration of the first training subject in this folder; otherwise
-    they are those of the body model in the topology.
+    they are the triangles of the body model in the topology.
 
     Raises:
         DataError: the body, or the meshes in the folder, are not available.

@@ -18,7 +18,7 @@ FIRST = 6
 class Errors(Mean):
     """Base class of metrics that are computed from the mean of |error| or error², such as MAE and RMSE.
 
-    The error is that of the point prediction. The metric is computed over all numbers of the target, and for each
+    A metric evaluates the point prediction. It is computed over all numbers of the target, and for each
     number separately if there are few.
 
     Raises:

@@ -56,7 +56,7 @@ def coverage(transforms: Transform, levels: Float[Tensor, "level"]) -> Float[Ten
     The levels are the masses of the intervals. A value counts with the probability that a number drawn uniformly
     between `low` and `high` of its transform lies between (1 - level) / 2 and (1 + level) / 2. This needs no random
     numbers (nonrandomized transform of Czado, Gneiting & Held 2009, eq. 2). The expected share equals the level if the
-    densities are those of the true values before rounding.
+    densities are correct for the true values before rounding.
     """
     low, high = (part.flatten() for part in transforms)
     width = high - low

@@ -115,7 +115,7 @@ def read_vgg(depth: Depth, file: str) -> VGG:
 def random_vgg(depth: Depth, width: int, taps: Sequence[tuple[int, int]], seed: int) -> VGG:
     """Return the network with random weights, which preserve the scale of the features from layer to layer.
 
-    The variance of the weights is that of He et al. 2015, eq. 10.
+    The variance of the weights follows He et al. 2015, eq. 10.
 
     Args:
         depth: number of layers of the whole network, 16 or 19.

@@ -75,7 +75,7 @@ class MeshCache:
     def find(self, indices: np.ndarray) -> Corners:
         """Return the `Corners` of `indices`, (faces, 3), from the cache; if it lacks them, add them first.
 
-        The indices are those of vertices or of texture coordinates.
+        The indices refer to vertices or to texture coordinates.
         """
         for mesh in self._meshes:
             if mesh.equals(indices):

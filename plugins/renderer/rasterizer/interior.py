@@ -1,10 +1,11 @@
-"""Gradients of a loss inside of faces, with respect to colours, textures, vertices and camera; compiled functions.
+"""Compiled functions for the part of a loss's gradient that comes from pixels inside of faces.
 
-Arrays are described in `raster`; `grad_*` is the gradient of the loss with respect to *. In camera coordinates a
-pixel's ray is r = ((column - cx) / fx, (row - cy) / fy, 1), and the barycentric weights of a face A, B, C under it are
-m_i / Σ m with m_0 = r·(B×C), m_1 = r·(C×A), m_2 = r·(A×B) (homogeneous edge functions, Olano & Greer 1997): linear in
-every corner, and valid for corners behind the camera. For a pixel beside its face, r is the ray to the point of the
-face that `shading` shows there; this ray counts as constant.
+The gradients are with respect to colours, textures, vertices and camera. Arrays are described in `raster`; an array
+`grad_x` is the gradient of the loss with respect to x. In camera coordinates a pixel's ray is r = ((column - cx) / fx,
+(row - cy) / fy, 1), and the barycentric weights of a face A, B, C under it are m_i / Σ m with m_0 = r·(B×C), m_1 =
+r·(C×A), m_2 = r·(A×B) (homogeneous edge functions, Olano & Greer 1997): linear in every corner, and valid for corners
+behind the camera. For a pixel beside its face, r is the ray to the point of the face that `shading` shows there; the
+gradient treats this ray as constant.
 """
 
 from typing import no_type_check
@@ -237,7 +238,7 @@ def add_face_gradient(camera_points, faces, index, sums, slot, lens, grad_points
 @compiled
 @no_type_check
 def add_texture_gradient(faces, colors, texture, face_weights, pixel, grad_colors, grad_texels, grad_uv):
-    """Add the gradients of one pixel to `grad_colors`, `grad_texels` and `grad_uv`, and return those of its weights.
+    """Add a pixel's gradients to `grad_colors`, `grad_texels` and `grad_uv`; return the gradients of its weights.
 
     The returned numbers are the gradients of the loss with respect to the pixel's three barycentric weights.
 

@@ -30,7 +30,8 @@ class Material:
     """The colour and texture of a surface.
 
     Attributes:
-        color: linear RGB; None if the file gives no colour. The stored numbers count as linear, as Blender writes them.
+        color: linear RGB; None if the file gives no colour. The stored numbers are read as linear RGB, which Blender
+            writes.
         texture: path of the texture file as it stands in the MTL file.
         library: the MTL file.
         wrap: rule for texture coordinates beyond the texture's edges.

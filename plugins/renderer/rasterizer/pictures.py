@@ -36,7 +36,8 @@ class Stage:
     """A scene prepared for drawing in colour.
 
     Attributes:
-        scene: the scene; its last colour channel is 1 everywhere, and renders as the covered share of each pixel.
+        scene: the scene; its last colour channel is 1 at every vertex, so that its render is the share of each pixel
+            that the scene covers.
         normals: unit normals of the vertices that are shaded by a light at the camera, 0 for the other vertices; None
             if no vertex is shaded.
     """

@@ -26,7 +26,7 @@ class Chain(nn.Module):
 
     Args:
         networks: networks that `layers_of` accepts; their weights are copied. There are equally many of each group.
-        dropout: probability of all dropout layers, for each group; None keeps those of the networks.
+        dropout: probability of all dropout layers, for each group; None keeps the probabilities of the networks.
     """
 
     steps: list[nn.Module]

@@ -51,7 +51,7 @@ class Folds(Uncertainty, SelfTraining):
 
     Args:
         folds: K, the number of folds.
-        dropout: probability of all dropout layers in each group; null keeps the one of the encoder.
+        dropout: probability of all dropout layers in each group; null keeps the probabilities of the encoder.
         weight_decay: weight decay in each group.
         learning_rate: largest learning rate.
         steps, epochs: each group trains for at least so many steps and passes over its samples.

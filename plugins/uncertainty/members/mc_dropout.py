@@ -45,9 +45,9 @@ class Layout(NamedTuple):
 class MCDropout(Uncertainty):
     """Mixture, with equal weights, of the densities under S dropout masks (thesis eq. 2.16; Gal & Ghahramani 2016).
 
-    Training and the validation loss are those of the wrapped model. In evaluation only its dropout layers (`DROPOUT`)
-    stay in training mode; batch norm normalises as in any evaluation. Every input of a batch has its own S masks,
-    sampled from torch's global generator. The wrapped model is calibrated without dropout.
+    In training, and for the validation loss, the wrapper equals the wrapped model. In evaluation only its dropout
+    layers (`DROPOUT`) stay in training mode; batch norm normalises as in any evaluation. Every input of a batch has its
+    own S masks, sampled from torch's global generator. The wrapped model is calibrated without dropout.
 
     Layers before the first dropout are computed once and not S times, if the network can be vectorised.
 

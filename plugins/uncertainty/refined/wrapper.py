@@ -23,10 +23,10 @@ DRAWS = 100
 class Refined(Uncertainty):
     """Least-squares fit of Lorentzian lines to each spectrum, starting from the wrapped model's prediction.
 
-    The returned density is that of the fit (`framework.spectra.fit`); the density of the wrapped model only gives the
-    starting point. The fit is a wrapper, so that network and fit are one experiment: they are trained, stored and
-    compared together, like any model. Any model can be wrapped, also an ensemble. With `steps=0` the density is that of
-    the wrapped model.
+    The returned density describes the fitted parameters (`framework.spectra.fit`); the density of the wrapped model
+    only gives the starting point. The fit is a wrapper, so that network and fit are one experiment: they are trained,
+    stored and compared together, like any model. Any model can be wrapped, also an ensemble. With `steps=0` the wrapped
+    model's density is returned.
 
     Attributes:
         steps: largest number of steps of a fit, which may be changed after training (a knob).

@@ -30,9 +30,9 @@ class Temperature(Uncertainty):
     """Temperature scaling of densities p to p^(1/T), normalised, with the T of highest validation likelihood.
 
     For classes this divides logits by T (thesis eq. 2.19 with β = 0). The modes stay the same. Before `calibrate` T is
-    1, and the densities are those of the wrapped model. The fitted T is never worse than 1 on the validation split. T
-    stays within its bounds for any targets: on a perfectly separable split, where the likelihood rises without end, T
-    stops at the bound, and the log says so.
+    1, which does not change the densities of the wrapped model. The fitted T is never worse than 1 on the validation
+    split. T stays within its bounds for any targets: on a perfectly separable split, where the likelihood rises without
+    end, T stops at the bound, and the log says so.
 
     Args:
         lower, upper: bounds of T.

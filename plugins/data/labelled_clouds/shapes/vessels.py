@@ -73,7 +73,7 @@ def leaves(
 
 
 def fronds(random: Random, count: int, start: Point, reach: Number, tall: Number) -> list[Solid]:
-    """Return `count` long leaves that rise from the point `start` and bend over, like those of a palm or of grass.
+    """Return `count` long leaves, like palm leaves or grass, that rise from the point `start` and bend over.
 
     `reach` is the largest horizontal extent of the leaves, and `tall` determines their height.
     """
