@@ -318,8 +318,8 @@ def textured(sides: list[tuple[int, int]]) -> bytes:
 def bombs() -> dict[str, tuple[Callable[[], bytes], Callable[[Path], object]]]:
     """Yield files, each with the functions that write and read it."""
     from framework.bodies import body_files, motion
+    from framework.scenes import scene_files
     from plugins.data.cest.volumes import read_volume
-    from plugins.renderer.rasterizer import scene_files
 
     def shown(file: Path) -> object:
         return Crop(file, None, 0.1, 64, 3, upright=True).read()

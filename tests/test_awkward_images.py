@@ -28,9 +28,9 @@ from framework.datasets import images, scan_layout
 from framework.deployment.served import ServedModel
 from framework.errors import DataError
 from framework.geometry.srgb import bytes_from_linear
+from framework.scenes import scene_files
+from framework.testing.sample_scenes import OBJ, PARTS, QUAD, glb
 from plugins.data.human_scans import skins
-from plugins.renderer.rasterizer import scene_files
-from plugins.renderer.rasterizer.sample_scenes import OBJ, PARTS, QUAD, glb
 
 SIDE = 32
 COLOURS = np.array([[255, 0, 0], [0, 200, 100], [40, 80, 250], [10, 30, 90]])

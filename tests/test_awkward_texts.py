@@ -26,13 +26,13 @@ from framework.datasets.csv_columns import (
 )
 from framework.errors import DataError
 from framework.geometry import meshes
+from framework.scenes import scene_files
 from framework.storage import text
 from plugins.data.cest.volumes import read_volume
 from plugins.data.head_pose import towncentre_labels
 from plugins.data.images_with_angles.table import read_table
 from plugins.data.moons.points import read_points
 from plugins.data.table_tennis import recordings
-from plugins.renderer.rasterizer import scene_files
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,13 @@ from framework.configuration.settings import Settings
 from framework.datasets.scan_layout import read_cameras
 from framework.errors import UserError
 from framework.runs.job import RECORD, VALUE, read_record
+from framework.scenes.gltf import read as read_gltf
+from framework.scenes.turntable import read_camera
 from framework.storage.plain_values import read_yaml
 from framework.sweeps.jobs import Job
 from framework.sweeps.results import read_results
 from framework.tracking.journal import _record
 from framework.tracking.run_info import SIDECAR, RunInfo, read_run_info
-from plugins.renderer.rasterizer.gltf import read as read_gltf
-from plugins.renderer.rasterizer.turntable import read_camera
 
 NO_NUMBERS = [True, "1_0", "nan", "0x10", " 1 ", "1", None, [], {}]
 """Values that are no numbers, although Python or NumPy converts most of them to one."""

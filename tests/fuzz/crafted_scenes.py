@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from plugins.renderer.rasterizer.sample_scenes import describe, glb, pack_glb, quad
+from framework.testing.sample_scenes import describe, glb, pack_glb, quad
 from tests.fuzz.crafted_files import HUGE, plain_png
 from tests.fuzz.damage import EXTREME, spoilt
 

@@ -22,10 +22,12 @@ from framework.datasets.images import Crop
 from framework.datasets.shards import open_shards
 from framework.geometry import meshes
 from framework.runs import resuming
+from framework.scenes import scene_files, turntable
 from framework.storage.generated import read_mark
 from framework.storage.weights import read_weights
 from framework.sweeps import jobs
 from framework.testing import sample_files
+from framework.testing import sample_scenes as scenes
 from framework.tracking.journal import Journal
 from framework.tracking.run_info import read_run_info
 from plugins.data.cest.volumes import read_volume
@@ -39,8 +41,6 @@ from plugins.data.pascal3d import layout
 from plugins.data.pose_from_image.data import PoseFromImage
 from plugins.data.registration import faust
 from plugins.data.table_tennis import recordings
-from plugins.renderer.rasterizer import sample_scenes as scenes
-from plugins.renderer.rasterizer import scene_files, turntable
 from tests.fuzz import crafted_files as crafted
 from tests.fuzz import crafted_scenes
 from tests.fuzz import damaged_files as whole

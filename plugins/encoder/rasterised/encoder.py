@@ -15,6 +15,7 @@ from framework.configuration.paths import FilePath
 from framework.data import Data
 from framework.datasets import scan_layout
 from framework.datasets.scan_layout import SubjectFolder
+from framework.datasets.scan_textures import Textures
 from framework.encoder import Encoder
 from framework.errors import ConfigError, DataError
 from framework.geometry.camera import canonical_camera
@@ -22,7 +23,6 @@ from framework.geometry.clouds import sizes
 from framework.geometry.mesh_files import COLOURS, XYZ
 from framework.geometry.srgb import linear_from_srgb, srgb_from_linear
 from framework.renderer import Renderer, Scene
-from plugins.encoder.rasterised.textures import Textures
 
 COLUMNS = (*XYZ, *COLOURS)
 Metres = Annotated[float, Field(gt=0, le=1e6)]

@@ -16,13 +16,13 @@ from PIL import ImageColor
 from framework.errors import ConfigError, DataError, did_you_mean, quote, shorten
 from framework.geometry.camera import Camera
 from framework.renderer import Report
+from framework.scenes import pictures, turntable
+from framework.scenes.parts import Axis
+from framework.scenes.scene_files import UPWARDS, read
 from framework.storage.commands import run_command
 from framework.storage.limits import MOST_SAMPLES
 from framework.storage.progress import track_progress
-from plugins.renderer.rasterizer import pictures, turntable
-from plugins.renderer.rasterizer.parts import Axis
 from plugins.renderer.rasterizer.renderer import Rasterizer
-from plugins.renderer.rasterizer.scene_files import UPWARDS, read
 
 EXAMPLE = """
 --camera names a JSON or YAML file with an exact camera in OpenCV's convention: a point X of the scene is seen at

@@ -18,10 +18,10 @@ from PIL import Image
 from framework.errors import ConfigError, DataError, UserError
 from framework.geometry.camera import look_from
 from framework.geometry.srgb import linear_from_bytes
-from plugins.renderer.rasterizer import pictures, turntable
+from framework.scenes import pictures, turntable
+from framework.scenes.scene_files import read
 from plugins.renderer.rasterizer.__main__ import main
 from plugins.renderer.rasterizer.renderer import Rasterizer
-from plugins.renderer.rasterizer.scene_files import read
 
 SIDES = {(1, 0, 0): "#ff0000", (-1, 0, 0): "#00ff00", (0, 1, 0): "#0000ff", (0, -1, 0): "#ffff00",
          (0, 0, 1): "#ff8040", (0, 0, -1): "#305070"}  # fmt: skip

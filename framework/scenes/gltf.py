@@ -1,7 +1,8 @@
 """Reader of glTF 2.0 (Khronos, 2021) files, .gltf and .glb: surfaces, base colours and positions.
 
 Other material properties, animations, lights and cameras are not read.
-Why not trimesh: for 70 of 124 valid test files it gives another scene or none (trimesh 5.2.0; see README.md).
+Why not trimesh: for 70 of 124 valid test files it gives another scene or none (trimesh 5.2.0;
+see docs/reference/files.md).
 """
 
 from collections.abc import Iterable, Iterator
@@ -16,16 +17,16 @@ from numpy.typing import NDArray
 
 from framework.errors import DataError, quote, shorten
 from framework.renderer import Wrap
-from framework.storage.limits import MOST_JOINT_SETS, MOST_PARTS
-from framework.storage.reading import translate_errors
-from plugins.renderer.rasterizer.gltf_document import (
+from framework.scenes.gltf_document import (
     WIDTHS,
     Document,
     open_document,
     to_numbers,
     whole_number,
 )
-from plugins.renderer.rasterizer.parts import NO_COORDINATES, Part, Subject, find_beside, join_parts
+from framework.scenes.parts import NO_COORDINATES, Part, Subject, find_beside, join_parts
+from framework.storage.limits import MOST_JOINT_SETS, MOST_PARTS
+from framework.storage.reading import translate_errors
 
 WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 NEAREST = 9728

@@ -1,6 +1,6 @@
 """Reader of scene files: surfaces, colours and textures.
 
-README.md says why trimesh does not read them ("Why not trimesh").
+docs/reference/files.md says why trimesh does not read them.
 """
 
 import re
@@ -15,9 +15,9 @@ from framework.errors import DataError, did_you_mean
 from framework.geometry import meshes
 from framework.geometry.mesh_files import COLOURS
 from framework.geometry.srgb import linear_from_bytes
+from framework.scenes import gltf, obj_materials
+from framework.scenes.parts import Axis, Part, Subject, TextureDecoder, find_beside, join_parts
 from framework.storage.reading import read_bytes, translate_errors
-from plugins.renderer.rasterizer import gltf, obj_materials
-from plugins.renderer.rasterizer.parts import Axis, Part, Subject, TextureDecoder, find_beside, join_parts
 
 UPWARDS: dict[str, Axis] = {".glb": "y", ".gltf": "y", ".obj": "y", ".off": "z", ".ply": "y", ".stl": "z"}
 """File suffixes that can be read, and the axis that points upwards in most such files."""

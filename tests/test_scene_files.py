@@ -16,8 +16,9 @@ from PIL import Image
 
 from framework.errors import DataError
 from framework.renderer import Scene
-from plugins.renderer.rasterizer import parts
-from plugins.renderer.rasterizer.sample_scenes import (
+from framework.scenes import parts
+from framework.scenes.scene_files import UPWARDS, read
+from framework.testing.sample_scenes import (
     CORNERS,
     MTL,
     OBJ,
@@ -29,7 +30,6 @@ from plugins.renderer.rasterizer.sample_scenes import (
     png,
     quad,
 )
-from plugins.renderer.rasterizer.scene_files import UPWARDS, read
 
 FOUR = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
 """An image with red and green above, blue and white below."""

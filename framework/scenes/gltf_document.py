@@ -2,7 +2,8 @@
 
 The file may be damaged or malicious: all its numbers are checked against bounds, and the size of every array is limited
 by the size of the file.
-Why not trimesh: it bounds neither memory nor time; a crafted file of 2 kB asks for 11 GiB (5.2.0; see README.md).
+Why not trimesh: it bounds neither memory nor time; a crafted file of 2 kB asks for 11 GiB (5.2.0;
+see docs/reference/files.md).
 """
 
 import base64
@@ -16,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from framework.errors import quote, shorten
+from framework.scenes.parts import TextureDecoder, resolve_beside
 from framework.storage.limits import SCENE_BYTES, UNFOLDED_TIMES
 from framework.storage.plain_values import plain_numbers
 from framework.storage.reading import read_bytes, translate_errors
-from plugins.renderer.rasterizer.parts import TextureDecoder, resolve_beside
 
 NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}

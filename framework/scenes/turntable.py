@@ -15,10 +15,10 @@ from framework.errors import DataError, did_you_mean, quote
 from framework.geometry.camera import Camera, focal_length
 from framework.geometry.rotation import about_z, viewpoint_rotation
 from framework.renderer import Scene
+from framework.scenes.parts import Axis
 from framework.storage.plain_values import LARGEST_YAML, plain_numbers, read_yaml
 from framework.storage.reading import read_bytes, translate_errors
 from framework.storage.text import decode
-from plugins.renderer.rasterizer.parts import Axis
 
 MARGIN = 1.03
 """Factor on the smallest distance from which the whole sphere around the subject is visible."""

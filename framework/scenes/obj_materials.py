@@ -1,7 +1,7 @@
 """Reader of colours in Wavefront OBJ files: texture coordinates, and materials of an MTL file beside the OBJ file.
 
 Why not trimesh: for 104 of 126 valid test files it gives another scene or none, and it reads 42 of 46 wrong files
-without an error (trimesh 5.2.0; see README.md).
+without an error (trimesh 5.2.0; see docs/reference/files.md).
 """
 
 from dataclasses import dataclass, field
@@ -15,9 +15,9 @@ from framework.errors import DataError, quote
 from framework.geometry import mesh_files
 from framework.geometry.mesh_files import join_continued_lines, line_numbers, statements
 from framework.renderer import Wrap
+from framework.scenes.parts import NO_COORDINATES, Part, TextureDecoder, find_beside
 from framework.storage.limits import MOST_MATERIALS
 from framework.storage.reading import read_bytes, translate_errors
-from plugins.renderer.rasterizer.parts import NO_COORDINATES, Part, TextureDecoder, find_beside
 
 OPTIONS = {"-blendu": 1, "-blendv": 1, "-cc": 1, "-boost": 1, "-imfchan": 1, "-texres": 1}
 """Texture options without effect on texture coordinates or wrap rule, and the number of words after each option."""

@@ -20,8 +20,8 @@ from framework.errors import ConfigError, DataError, shorten
 from framework.geometry.camera import Camera
 from framework.geometry.srgb import bytes_from_linear, linear_from_bytes
 from framework.renderer import Scene
+from framework.scenes.parts import Subject
 from framework.storage.files import replacing
-from plugins.renderer.rasterizer.parts import Subject
 
 AMBIENT = 0.12
 """Brightness of a surface seen edge-on, as a share of the brightness of a surface that faces the camera."""

@@ -61,9 +61,9 @@ class Textures:
                     f"{file}: no such file; expected the texture of this subject. Add the file (for generated people: "
                     "set data.texture_side above 0), or use vertex colours: experiment=smplpix/rasterised."
                 )
-            registration = scan_layout.read_registration(folder / f"registration_{topology}.ply")
-            self.vertices = len(registration.vertices)
-            other = self.files.setdefault(_digest(registration.colors), file)
+            registered = scan_layout.read_registration(folder / f"registration_{topology}.ply")
+            self.vertices = len(registered.vertices)
+            other = self.files.setdefault(_digest(registered.colors), file)
             if other != file and read_bytes(other) != read_bytes(file):
                 raise DataError(
                     f"{file.parent} and {other.parent} have the same vertex colours, which identify a subject, but "
