@@ -5,12 +5,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.data import Batch
-from framework.model import Predictor
+from framework.model import FrozenFrontEnd, Predictor
 
 
 class Uncertainty(Predictor):
@@ -35,6 +36,11 @@ class Uncertainty(Predictor):
     """The wrapped predictor; by default `loss`, `training_densities` and `calibrate` are those of this predictor.
 
     A wrapper of several predictors does not set it, and overrides these methods.
+    """
+    varies_weights: ClassVar[bool] = False
+    """True if predictions need the layers of the wrapped model, because they use other weights than the trained ones.
+
+    A frozen predictor then keeps these layers, instead of computing them by other means than torch.
     """
     remark: str = ""
     """A sentence for the user about the result of `calibrate`; "" if there is nothing to report.
@@ -136,6 +142,54 @@ def held_out(predictor: Predictor, batch: Batch) -> Iterator[None]:
         yield
     finally:
         wrapper.rows = None
+
+
+class ReadsTraining:
+    """Additional base class of a wrapper whose `calibrate` reads the training split too, to fit a posterior of weights.
+
+    `calibrate` is still given the validation split. A wrapper that trains its models itself (`SelfTraining`) cannot
+    contain such a wrapper, because each of its models has a training split of its own.
+
+    Attributes:
+        training_split: batches of the training split without augmentation, which may be iterated repeatedly; set by
+            `reading_training` only, while `calibrate` runs. None: `calibrate` has no other samples than those that it
+            is given.
+    """
+
+    training_split: Iterable[Batch] | None = None
+
+
+@contextmanager
+def reading_training(predictor: Predictor, batches: Iterable[Batch]) -> Iterator[None]:
+    """Give the training split to all wrappers that read it (`ReadsTraining`), inside the block.
+
+    Args:
+        predictor: the predictor.
+        batches: batches of the training split, which may be iterated repeatedly.
+    """
+    readers = [module for module in predictor.modules() if isinstance(module, ReadsTraining)]
+    split = _Features(predictor, batches) if isinstance(predictor, FrozenFrontEnd) else batches
+    try:
+        for reader in readers:
+            reader.training_split = split
+        yield
+    finally:
+        for reader in readers:
+            reader.training_split = None
+
+
+class _Features:
+    """Batches whose inputs are the features of a predictor's fixed encoders."""
+
+    def __init__(self, front: FrozenFrontEnd, batches: Iterable[Batch]) -> None:
+        self.front = front
+        self.batches = batches
+
+    def __iter__(self) -> Iterator[Batch]:
+        for batch in self.batches:
+            with torch.no_grad():
+                features = self.front.features(batch["input"])
+            yield {**batch, "input": features}
 
 
 def remarks(predictor: Predictor) -> tuple[str, ...]:

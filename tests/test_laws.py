@@ -15,7 +15,16 @@ CORE = sorted((ROOT / "framework").rglob("*.py"))
 PLUGINS = sorted(path for path in (ROOT / "plugins").rglob("*.py") if path.parent != ROOT / "plugins")
 
 
-MATHEMATICS = {"points", "projection", "temperature", "mixture", "categorical", "bernoulli", "quantiles"}
+MATHEMATICS = {
+    "points",
+    "projection",
+    "temperature",
+    "mixture",
+    "categorical",
+    "bernoulli",
+    "quantiles",
+    "laplace",
+}
 """Entry points whose names are mathematical terms, which the framework may use."""
 
 
@@ -197,6 +206,7 @@ NOT_IN_THE_THESIS = {
     "metric/risk_coverage",
     "uncertainty/conformal",
     "uncertainty/folds",
+    "uncertainty/laplace",
 }
 """Plugin folders whose methods and data the thesis does not have; their pages do not compare with it."""
 

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from framework.density_head import Fitted
 from framework.deployment.onnx_programs import Session, can_run_onnx, quiet_export, write_onnx
 from framework.model import Model, Predictor, RawNetwork
+from framework.uncertainty import Uncertainty
 
 PROBES = (1, 3)
 """Numbers of inputs for which a network of ONNX Runtime is compared with the original one."""
@@ -60,7 +61,8 @@ def use_onnx(predictor: Predictor, shape: Sequence[int], dtype: torch.dtype) -> 
     """Replace the networks of a predictor, in place, by networks that ONNX Runtime computes where this is possible.
 
     Networks keep their form if the packages are not installed, their inputs are point clouds, whose encoders check
-    them, a layer such as dropout is random in evaluation, or ONNX has no form for a layer.
+    them, a layer such as dropout is random in evaluation, a wrapper varies their weights, or ONNX has no form for a
+    layer.
 
     Args:
         predictor: predictor in evaluation mode, on the CPU.
@@ -76,7 +78,13 @@ def use_onnx(predictor: Predictor, shape: Sequence[int], dtype: torch.dtype) -> 
     if _trains(predictor, probe):
         return 0
     count = 0
-    for module in list(predictor.modules()):
+    kept = {
+        part
+        for wrapper in predictor.modules()
+        if isinstance(wrapper, Uncertainty) and wrapper.varies_weights
+        for part in wrapper.modules()
+    }
+    for module in (module for module in list(predictor.modules()) if module not in kept):
         trained = next(module.parameters(), None) is not None
         if isinstance(module, Model) and not isinstance(module.head, Fitted) and trained:
             network = _converted(nn.Sequential(module.encoders, module.projection), probe)

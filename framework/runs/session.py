@@ -64,7 +64,7 @@ from framework.storage.progress import output
 from framework.target import Target
 from framework.tracking.run_info import MODEL
 from framework.training.batches import Batches, require_targets, track_batches
-from framework.uncertainty import SelfTraining, remarks, self_training
+from framework.uncertainty import ReadsTraining, SelfTraining, reading_training, remarks, self_training
 
 if TYPE_CHECKING:  # a metric imports torchmetrics, which predictions do not need
     from framework.metric import Metric
@@ -219,6 +219,12 @@ def for_training(config: Config) -> Session:
         raise ConfigError(
             f"{type(trains_itself).__name__} trains its models itself, so that an objective has no effect. Leave "
             "objective out, or choose another uncertainty."
+        )
+    reader = next((part for part in predictor.modules() if isinstance(part, ReadsTraining)), None)
+    if trains_itself is not None and reader is not None:
+        raise ConfigError(
+            f"{type(reader).__name__} reads the training split of the model that it wraps, but "
+            f"{type(trains_itself).__name__} trains models on parts of it. Leave one of the two out of uncertainty."
         )
     if not learns(predictor) and not resumed:
         _refuse_training(config, "no part of this model learns by gradient")
@@ -394,7 +400,9 @@ def rehearse(session: Session) -> None:
             numbers([cast("Metric", trial)])
         few = validation_batch if not session.parts["uncertainty"] else _first_samples(splits.validation, FEW)
         with torch.enable_grad():
-            deepcopy(session.predictor).eval().calibrate([few])
+            trial_predictor = deepcopy(session.predictor).eval()
+            with reading_training(trial_predictor, [_first_samples(splits.train, FEW)]):
+                trial_predictor.calibrate([few])
 
 
 def _first_samples(dataset: Dataset[Batch], most: int) -> Batch:
@@ -635,9 +643,21 @@ def calibrate(session: Session) -> None:
         batches = trained_batches(session.blocks())
     else:
         batches = track_batches(session.blocks().val_dataloader(), "calibrating")
-    session.predictor.calibrate(on_device(batches, session.device))
+    with reading_training(session.predictor, _TrainingSplit(session)):
+        session.predictor.calibrate(on_device(batches, session.device))
     for remark in remarks(session.predictor):
         session.console.print(remark, soft_wrap=True, highlight=False, markup=False)
+
+
+@dataclass(frozen=True)
+class _TrainingSplit:
+    """Batches of a session's training split, on its device and without augmentation, loaded at each iteration."""
+
+    session: Session
+
+    def __iter__(self) -> Iterator[Batch]:
+        session = self.session
+        return on_device(session.blocks().of(session.data.splits().train), session.device)
 
 
 def trained_batches(batches: Batches) -> Iterator[Batch]:

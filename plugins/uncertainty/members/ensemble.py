@@ -9,13 +9,13 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
+from framework.calibration.equal_mixture import equal_mixture
 from framework.data import Batch
 from framework.density_head import DensityHead, Fitted
 from framework.distributions.batch_shapes import Stacked
 from framework.errors import ConfigError, UserError
 from framework.model import Model, Predictor, SharedResult, independent_penalty, own_sample_penalty
 from framework.uncertainty import Joining, SeveralModels, Uncertainty
-from plugins.uncertainty.members.equal_mixture import equal_mixture
 from plugins.uncertainty.members.side_by_side import SideBySide
 
 WORTH_TRYING = (1, 2, 3, 5, 10, 20, 50)

@@ -11,6 +11,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
+from framework.calibration.equal_mixture import equal_mixture
 from framework.calibration.module_flags import set_flag
 from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.distributions.given_draws import draws_are_given
@@ -18,7 +19,6 @@ from framework.errors import ConfigError, UserError
 from framework.model import Model, Predictor
 from framework.storage.limits import MOST_DRAWS
 from framework.uncertainty import Uncertainty
-from plugins.uncertainty.members.equal_mixture import equal_mixture
 
 DROPOUT = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout)
 AT_ONCE = 2**24

@@ -5,6 +5,7 @@ import torch
 from torch import nn
 from torch.distributions import Categorical
 
+from framework.calibration.equal_mixture import equal_mixture
 from framework.configuration.schema import build, resolve
 from framework.density_head import DensityHead
 from framework.distributions.density import Mixture
@@ -13,7 +14,6 @@ from framework.model import Model, Predictor
 from framework.target import Target
 from framework.uncertainty import own_batches
 from plugins.uncertainty.members.ensemble import Ensemble, network
-from plugins.uncertainty.members.equal_mixture import equal_mixture
 from plugins.uncertainty.members.side_by_side import SideBySide
 
 CLASSES = Target("class", ("a", "b", "c"))

@@ -1,4 +1,4 @@
-"""The mixture with equal weights, shared by ensembles and Monte Carlo dropout."""
+"""The mixture with equal weights, shared by wrappers of several members or samples of weights."""
 
 import torch
 from torch import nn

@@ -1,0 +1,194 @@
+"""Gaussian posterior of the weights of a linear layer: Fisher information, precision of the prior, draws.
+
+The layer maps features φ, to which a 1 is appended if it has a bias, to raw parameters W φ. With the prior N(0, I/λ) of
+each weight and the Fisher information H of all training samples, the Laplace approximation of the posterior is
+N(W*, (H + λ I)⁻¹) around the trained weights W* (Daxberger et al. 2021). All three forms of H are stored by
+their eigenvalues and eigenvectors, so that any λ can be used afterwards.
+"""
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.errors import UserError
+
+Covariance = Literal["full", "kronecker", "diagonal"]
+DRAWS = 32
+"""Number of targets per training sample that are drawn for the Fisher information, if it has no closed form."""
+LARGEST_EXPONENT = 30.0
+"""Bound on the logarithm of the precision of the prior, to both sides of 1."""
+STEPS = 80
+"""Number of halvings of the interval of log λ, after which its length is below the rounding error of float64."""
+
+
+class Eigen(NamedTuple):
+    """Fisher information of the weights (raw, feature), by eigenvalues and eigenvectors.
+
+    Attributes:
+        values: eigenvalues, (raw · feature,) float64, at least 0; the diagonal itself for a diagonal matrix.
+        vectors: the eigenvectors as columns: one matrix for "full"; the matrices (raw, raw) and (feature, feature) of
+            the two Kronecker factors for "kronecker"; none for "diagonal".
+    """
+
+    values: Tensor
+    vectors: tuple[Tensor, ...]
+
+
+def fisher_of_raw(
+    density_of: Callable[[Tensor], Distribution], raw: Float[Tensor, "batch raw"]
+) -> Float[Tensor, "batch raw raw"]:
+    """Return the Fisher information of the raw parameters of each sample, float64.
+
+    It is E[g gᵀ] over targets y of the predicted density, with the score g = ∇ log p(y | raw). Where the raw parameters
+    are natural parameters, it equals the generalised Gauss-Newton matrix (Martens 2020); it is positive
+    semi-definite for every density. The expectation is a sum over all classes, or the Hessian of -log p where this
+    Hessian is the same for all y (such as a normal density of fixed variance); for any other density it is a mean over
+    DRAWS draws of y.
+
+    Args:
+        density_of: function from raw parameters to densities of batch_shape (batch,).
+        raw: raw parameters.
+
+    Raises:
+        UserError: a score is not finite.
+    """
+    with torch.enable_grad():
+        leaf = raw.detach().clone().requires_grad_()
+        density = density_of(leaf)
+        if density.has_enumerate_support:
+            targets = list(density.enumerate_support())
+        else:
+            with torch.no_grad():
+                targets = [density.sample() for _ in range(DRAWS)]
+            constant = _constant_hessian(density, leaf, targets)
+            if constant is not None:
+                return constant
+        logs = torch.stack([density.log_prob(target) for target in targets])
+        rows = [torch.autograd.grad(log.sum(), leaf, retain_graph=True)[0] for log in logs]
+    scores = torch.stack(rows, 1).double()  # (batch, target, raw)
+    if not scores.isfinite().all():
+        row = int((~scores.isfinite()).flatten(1).any(1).nonzero()[0])
+        raise UserError(
+            "uncertainty laplace: the gradient of the log-density in the raw parameters is not finite for sample "
+            f"{row} of a training batch. Check this sample and the training, which may have diverged."
+        )
+    if density.has_enumerate_support:
+        weights = logs.detach().double().exp().T
+    else:
+        weights = scores.new_full(scores.shape[:2], 1 / DRAWS)
+    return torch.einsum("bt,bti,btj->bij", weights, scores, scores)
+
+
+def _constant_hessian(
+    density: Distribution, leaf: Float[Tensor, "batch raw"], targets: list[Tensor]
+) -> Float[Tensor, "batch raw raw"] | None:
+    """Return the Hessian of -log p in the raw parameters if it is the same for two targets; None otherwise."""
+    hessians = []
+    try:
+        for target in targets[:2]:
+            (score,) = torch.autograd.grad(density.log_prob(target).sum(), leaf, create_graph=True)
+            if not score.requires_grad:
+                return None
+            rows = [torch.autograd.grad(part, leaf, retain_graph=True)[0] for part in score.sum(0).unbind()]
+            hessians.append(-torch.stack(rows, 1).double())
+    except RuntimeError:  # a density without second derivatives
+        return None
+    first, second = hessians
+    largest = first.abs().amax((1, 2), keepdim=True)
+    equal = ((first - second).abs() <= 1e-5 * largest).all() and first.isfinite().all()
+    if not equal or (torch.linalg.eigvalsh(first) < -1e-5 * largest.squeeze(-1)).any():
+        return None
+    return first
+
+
+def collect(
+    parts: Iterable[tuple[Float[Tensor, "batch feature"], Float[Tensor, "batch raw raw"]]],
+    covariance: Covariance,
+) -> tuple[Eigen, int]:
+    """Return the eigenvalues and eigenvectors of the Fisher information of the weights, and the number of samples.
+
+    The information is H = Σ_n Λ_n ⊗ φ_n φ_nᵀ (Kristiadi, Hein & Hennig 2020). "diagonal" keeps its diagonal;
+    "kronecker" approximates it by (Σ_n Λ_n / N) ⊗ (Σ_n φ_n φ_nᵀ) (Martens & Grosse 2015).
+
+    Args:
+        parts: features φ and Fisher information Λ of the raw parameters, batch by batch, float64.
+        covariance: form of the matrix.
+    """
+    count = 0
+    sums: list[Tensor] = []
+    for features, fisher in parts:
+        count += len(features)
+        if covariance == "full":
+            size = fisher.shape[1] * features.shape[1]
+            outer = torch.einsum("nij,na,nb->iajb", fisher, features, features)
+            new = [outer.reshape(size, size)]
+        elif covariance == "kronecker":
+            new = [fisher.sum(0), features.T @ features]
+        else:
+            new = [torch.einsum("nii,na->ia", fisher, features.square()).flatten()]
+        sums = [total + part for total, part in zip(sums, new, strict=True)] if sums else new
+    if covariance == "diagonal":
+        return Eigen(sums[0], ()), count
+    if covariance == "kronecker":
+        sums[0] = sums[0] / count
+    values, vectors = zip(*(torch.linalg.eigh(matrix) for matrix in sums), strict=True)
+    positive = [part.clamp(min=0) for part in values]
+    spectrum = positive[0] if covariance == "full" else torch.outer(*positive).flatten()
+    return Eigen(spectrum, tuple(vectors)), count
+
+
+def log_evidence(eigenvalues: Float[Tensor, "weight"], square: float, precision: float) -> float:
+    """Return the terms of the Laplace approximation of the log marginal likelihood that depend on the prior, nats.
+
+    They are P/2 log λ - λ/2 |W*|² - 1/2 log det(H + λ I) (MacKay 1992).
+
+    Args:
+        eigenvalues: eigenvalues of H.
+        square: |W*|², the sum of the squared weights.
+        precision: λ.
+    """
+    ratio = torch.log1p(eigenvalues / precision).sum().item()
+    return -(ratio + precision * square) / 2
+
+
+def most_likely_precision(eigenvalues: Float[Tensor, "weight"], square: float) -> float:
+    """Return the precision λ of the prior of highest marginal likelihood (`log_evidence`).
+
+    Its derivative in log λ is (γ - λ |W*|²) / 2, with the number γ = Σ h/(h + λ) of determined weights (MacKay 1992).
+    The derivative decreases in λ, so its only zero is found by bisection. λ is bounded by
+    e^±LARGEST_EXPONENT.
+    """
+    low, high = -LARGEST_EXPONENT, LARGEST_EXPONENT
+    for _ in range(STEPS):
+        middle = (low + high) / 2
+        precision = math.exp(middle)
+        if (eigenvalues / (eigenvalues + precision)).sum().item() > precision * square:
+            low = middle
+        else:
+            high = middle
+    return math.exp((low + high) / 2)
+
+
+def draw_deviations(
+    eigen: Eigen, precision: Tensor, noise: Float[Tensor, "sample weight"], shape: tuple[int, int]
+) -> Float[Tensor, "sample raw feature"]:
+    """Return deviations of the weights from their mean, of the covariance (H + λ I)⁻¹.
+
+    Args:
+        eigen: H.
+        precision: λ, 0-dimensional.
+        noise: standard normal numbers.
+        shape: shape (raw, feature) of the weights.
+    """
+    scaled = noise / (eigen.values + precision).sqrt()
+    if not eigen.vectors:
+        return scaled.unflatten(1, shape)
+    if len(eigen.vectors) == 1:
+        return (scaled @ eigen.vectors[0].T).unflatten(1, shape)
+    raws, features = eigen.vectors
+    return raws @ scaled.unflatten(1, shape) @ features.T
