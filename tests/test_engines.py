@@ -50,6 +50,13 @@ def handles(app: App, *numbers: int) -> list[str]:
     return [app.record(number)["handle"] for number in numbers]
 
 
+def start_requeued_job(app: App, slurm: SlurmCluster) -> None:
+    """Start job 0 as soon as SLURM has queued it again; SLURM itself waits two minutes."""
+    number = app.record(0)["handle"].partition(":")[2]
+    wait_for(lambda: slurm.command("squeue", "-h", "-j", number, "-o", "%T").strip() == "PENDING", 60)
+    slurm.command("scontrol", "update", f"JobId={number}", "StartTime=now")
+
+
 def test_a_sweep_begun_on_slurm_is_finished_on_the_pool(app: App) -> None:
     code, output = app("what=ok,raise,once", "x=1")
     assert code == 1, output
@@ -108,6 +115,7 @@ def test_a_job_is_neither_lost_nor_doubled_when_its_node_dies(app: App, slurm: S
     assert app.record(0)["status"] == "running", "SLURM has queued the job again by itself"
     (app.folder / "release").touch()
     slurm.start_node(nodes[0])
+    start_requeued_job(app, slurm)
     assert process.wait(timeout=200) == 0, app.said()
     assert handles(app, 0, 1) == before
     assert [app.tries(job) for job in range(2)] == [2, 1]
@@ -121,6 +129,7 @@ def test_a_job_at_its_time_limit_is_queued_again_and_goes_on(app: App, slurm: Sl
     slurm.command("scancel", "--signal=USR2", app.record(0)["handle"].partition(":")[2])
     wait_for((app.sweep / "0" / "closed SIGTERM").exists)
     (app.folder / "release").touch()
+    start_requeued_job(app, slurm)
     assert process.wait(timeout=200) == 0, app.said()
     assert (app.tries(0), app.record(0)["status"]) == (2, "completed")
     assert app.record(0)["processor_seconds"] > 0
