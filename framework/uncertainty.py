@@ -106,7 +106,13 @@ class SelfTraining(ABC):
 
     @abstractmethod
     def train_models(
-        self, inputs: Float[Tensor, "sample *input"], target: Tensor, *, seed: int, batch_size: int
+        self,
+        inputs: Float[Tensor, "sample *input"],
+        target: Tensor,
+        *,
+        seed: int,
+        batch_size: int,
+        most_steps: int | None = None,
     ) -> float:
         """Train and calibrate all models in place, and return the mean loss over all samples, nats.
 
@@ -117,6 +123,8 @@ class SelfTraining(ABC):
             target: targets of the same samples, (sample, *event).
             seed: seed of random numbers.
             batch_size: number of samples of a training batch of each model.
+            most_steps: largest number of training steps of each model, set in a short test run (`debug=fast`); None for
+                no limit.
         """
 
 

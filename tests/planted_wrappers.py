@@ -270,7 +270,9 @@ class KnobsDescend(Tempered):
 class TrainsUnseeded(Tempered, SelfTraining):
     """Trains its model itself, with numbers of torch's global generator."""
 
-    def train_models(self, inputs: Tensor, target: Tensor, *, seed: int, batch_size: int) -> float:
+    def train_models(
+        self, inputs: Tensor, target: Tensor, *, seed: int, batch_size: int, most_steps: int | None = None
+    ) -> float:
         with torch.no_grad():
             for parameter in self.parameters():
                 parameter.add_(0.1 * torch.randn(parameter.shape))

@@ -121,7 +121,11 @@ def _train_itself(session: Session, run: Run, wrapper: SelfTraining) -> float:
             loaded = [{**batch, "input": front.features(batch["input"])} for batch in loaded]
     inputs, target = (torch.cat([batch[name] for batch in loaded]) for name in ("input", "target"))
     settings = session.settings
-    loss = wrapper.train_models(inputs, target, seed=settings.seed, batch_size=settings.batch_size)
+    batches = settings.trainer.get("limit_train_batches")  # set in a short test run (`debug=fast`) only
+    most_steps = batches * settings.trainer.get("max_epochs", 1) if isinstance(batches, int) else None
+    loss = wrapper.train_models(
+        inputs, target, seed=settings.seed, batch_size=settings.batch_size, most_steps=most_steps
+    )
     session.console.print(
         f"trained on {len(inputs)} samples of training and validation in {time.perf_counter() - start:.1f} s; loss of "
         f"samples that a model did not see {loss:.4f} nats"

@@ -395,7 +395,9 @@ def _trains_itself(make: Make, row: WrapperRow, worst: Worst) -> None:
             return
         before = [parameter.detach().clone() for parameter in wrapper.parameters()]
         state = torch.get_rng_state()
-        losses.append(torch.tensor(wrapper.train_models(features, target, seed=SEED, batch_size=16)))
+        losses.append(
+            torch.tensor(wrapper.train_models(features, target, seed=SEED, batch_size=16, most_steps=20))
+        )
         worst.count(not torch.equal(torch.get_rng_state(), state), "training changes torch's random state")
         same = [torch.equal(old, new) for old, new in zip(before, wrapper.parameters(), strict=True)]
         worst.count(all(same), "training changes no parameter")

@@ -46,6 +46,14 @@ def table(count=120):
     return inputs, (3 + 2 * inputs[:, 0].sin() + noise).double().unsqueeze(1)
 
 
+def test_a_short_test_run_takes_at_most_its_steps():
+    wrapper, (inputs, target) = folds(), table()
+    trained = {"seed": 0, "batch_size": 16}
+    expected = folds(steps=3).train_models(inputs, target, **trained, most_steps=3)
+    assert wrapper.train_models(inputs, target, **trained, most_steps=3) == expected
+    assert wrapper.train_models(inputs, target, **trained) < expected
+
+
 def test_each_sample_is_predicted_by_models_that_did_not_see_it():
     wrapper, (inputs, target) = folds(), table()
     loss = wrapper.train_models(inputs, target, seed=0, batch_size=16)

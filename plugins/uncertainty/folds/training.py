@@ -32,6 +32,7 @@ class Schedule:
         learning_rate: largest learning rate of AdamW.
         weight_decay: decay of the weights in each group; biases do not decay.
         batch_size: samples of a batch of each model.
+        most_steps: the training takes at most so many steps.
     """
 
     steps: int
@@ -39,10 +40,11 @@ class Schedule:
     learning_rate: float
     weight_decay: Sequence[float]
     batch_size: int = 64
+    most_steps: int = MOST_STEPS
 
     def count_steps(self, batches: int) -> int:
         """Return the number of steps for a pass of `batches` batches."""
-        return min(MOST_STEPS, max(self.steps, self.epochs * batches))
+        return min(self.most_steps, max(self.steps, self.epochs * batches))
 
     def rate(self, step: int, steps: int) -> float:
         """Return the learning rate at a step: a linear rise, then half a cosine to 0."""

@@ -21,7 +21,7 @@ from framework.storage.progress import track_progress
 from framework.storage.weights import require_state
 from framework.uncertainty import SelfTraining, Uncertainty
 from plugins.uncertainty.folds.groups import build_models
-from plugins.uncertainty.folds.training import Schedule, Training, assign_folds
+from plugins.uncertainty.folds.training import MOST_STEPS, Schedule, Training, assign_folds
 
 Probability = Annotated[float, Field(ge=0, lt=1)]
 Decay = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -128,7 +128,13 @@ class Folds(Uncertainty, SelfTraining):
         return Stacked(self.models.training_densities(inputs))
 
     def train_models(
-        self, inputs: Float[Tensor, "sample *input"], target: Tensor, *, seed: int, batch_size: int
+        self,
+        inputs: Float[Tensor, "sample *input"],
+        target: Tensor,
+        *,
+        seed: int,
+        batch_size: int,
+        most_steps: int | None = None,
     ) -> float:
         """Train and calibrate all models; return the mean loss of samples by models that did not see them, nats."""
         if len(inputs) < 2 * self.folds:
@@ -141,7 +147,9 @@ class Folds(Uncertainty, SelfTraining):
             seed_step(seed, 0, "folds")
             self._fold = assign_folds(inputs.cpu(), self.folds)
             self.train()
-            schedule = replace(self.schedule, batch_size=batch_size)
+            schedule = replace(
+                self.schedule, batch_size=batch_size, most_steps=min(MOST_STEPS, most_steps or MOST_STEPS)
+            )
             training = Training(self.models, inputs, target, self._fold, self.folds, schedule)
             for _ in track_progress(training, "training", len(training), "steps"):
                 pass
