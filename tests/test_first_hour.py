@@ -41,7 +41,8 @@ def test_own_data_are_named_and_long_work_says_how_far_it_is(tmp_path: Path) -> 
         "data=tabular data.path=faces.csv data.target=gaze data.kind=degrees encoder=[mlp] density_head=scvae "
         "metric=[log_likelihood,angular_deviation,coverage,risk_coverage] trainer.max_epochs=1 batch_size=16 "
         f"samples=20 pictures=svg hydra.run.dir=one {always}",
-        f"mode=predict checkpoint=one data.path=faces.csv hydra.run.dir=two {always}",
+        f"mode=predict checkpoint=./one data.path=faces.csv hydra.run.dir=two {always}",
+        "mode=report mode.run=./one",
         "mode=work_precision checkpoint=one data.path=faces.csv mode.values=[1,2] mode.repeats=2 mode.reference=4 "
         f"mode.metrics=[error_nats,maad_deg] pictures=svg hydra.run.dir=three {always}",
     ]
@@ -53,6 +54,8 @@ def test_own_data_are_named_and_long_work_says_how_far_it_is(tmp_path: Path) -> 
         assert work in done.stderr, done.stderr
     assert "measuring errors: 2 of 2 values of samples" in done.stderr
     assert "faces · scvae, 18 test samples" in done.stdout
+    assert "mode=predict checkpoint=./one mode.files=<your files>" in done.stdout
+    assert "mode=report mode.run=./one\n" in done.stdout
     pictures = {path.name: written(path) for path in (tmp_path / "one" / "figures").iterdir()}
     names = ("training_curve", "predicted_densities", "coverage", "risk_coverage")
     assert set(pictures) == {f"{name}.svg" for name in names}

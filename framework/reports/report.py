@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
+from framework.configuration.paths import shell_arguments
 from framework.errors import UserError
 from framework.evaluation.cost import Cost
 from framework.evaluation.splits import Evaluation, cost, evaluate
@@ -188,5 +189,15 @@ def _next_steps(run: Run, run_cost: Cost, console: Console) -> None:
         f"all runs:      {run.tracker.url}",
         f"in a notebook: framework.load('{model}')",
         f"what to cite:  {run.folder / 'citations.bib'}",
+        f"next commands: python -m framework mode=predict {_argument('checkpoint', model)} mode.files=<your files>",
+        f"               python -m framework mode=report {_argument('mode.run', run.folder)}",
+        "               and mode=calibrate, mode=export, sweeps: docs/commands.md",
     ]
     console.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
+
+
+def _argument(key: str, path: Path | str | None) -> str:
+    """Return the command-line argument that sets a key to a path, which is relative if it is in the working folder."""
+    absolute = Path(str(path)).absolute()
+    inside = absolute.is_relative_to(Path.cwd())
+    return shell_arguments({key: f"./{absolute.relative_to(Path.cwd())}" if inside else str(absolute)})[0]
