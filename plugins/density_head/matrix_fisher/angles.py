@@ -8,7 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from framework.distributions.shapes import broadcast_shapes
-from plugins.density_head.matrix_fisher import quadrature, quaternions
+from framework.geometry import quaternions
+from plugins.density_head.matrix_fisher import quadrature
 from plugins.density_head.matrix_fisher.functions import Frame, log_height
 
 CHUNK = 2**18

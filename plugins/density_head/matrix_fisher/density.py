@@ -15,7 +15,8 @@ from framework.distributions.exported import Exported, exported
 from framework.distributions.panels import entropy_of_one
 from framework.distributions.protocol import estimate, exact_estimate, marginal, pick, take, tempered_density
 from framework.distributions.uniform import uniform
-from plugins.density_head.matrix_fisher import angles, functions, quadrature, quaternions
+from framework.geometry import quaternions
+from plugins.density_head.matrix_fisher import angles, functions, quadrature
 
 VOLUME = 8 * math.pi**2
 """Volume of all rotations in the coordinates azimuth a, elevation e and tilt t (CHART), ∫ cos e da de dt."""
@@ -76,7 +77,7 @@ class MatrixFisher(Distribution):
 
         This is the mode of the rotation's density: the factor cos e of the viewpoint's density is not included.
         """
-        return quaternions.viewpoint(self.frame.mode).to(self.dtype)
+        return quaternions.to_viewpoint(self.frame.mode).to(self.dtype)
 
     def log_prob(self, value: Float[Tensor, "... 3"]) -> Float[Tensor, "..."]:
         exact = value.double()
@@ -86,7 +87,7 @@ class MatrixFisher(Distribution):
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         shape = torch.Size(sample_shape) + self.batch_shape + self.event_shape
         aligned = functions.sample(self.frame.falls.expand(shape))
-        return quaternions.viewpoint(self.frame.turn(aligned)).to(self.dtype)
+        return quaternions.to_viewpoint(self.frame.turn(aligned)).to(self.dtype)
 
     def entropy(self) -> Tensor:
         """Return the entropy, nats, with respect to da de dt; without gradient.

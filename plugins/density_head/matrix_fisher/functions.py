@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd import Function
 
-from plugins.density_head.matrix_fisher import quaternions
+from framework.geometry import quaternions
 
 SAMPLING_ROUNDS = 96
 """Largest number of proposals per sample.

@@ -10,9 +10,10 @@ from framework.configuration.schema import build, resolve
 from framework.distributions.density import Mixture, circular_grid
 from framework.distributions.protocol import marginal, median, pick
 from framework.errors import ConfigError
+from framework.geometry import quaternions
 from framework.geometry.rotation import viewpoint_rotation
 from framework.target import Target
-from plugins.density_head.matrix_fisher import angles, functions, quadrature, quaternions
+from plugins.density_head.matrix_fisher import angles, functions, quadrature
 from plugins.density_head.matrix_fisher.density import Angle, MatrixFisher
 from plugins.density_head.matrix_fisher.head import LARGEST_PARAMETER, parameter_of_raw
 from plugins.density_head.matrix_fisher.rows import TARGET, log_constant
@@ -69,7 +70,7 @@ def test_quaternions_are_the_rotations_of_viewpoints():
     torch.testing.assert_close(
         (quaternions.of_matrix(rotation) * turn).sum(-1).abs(), torch.ones(500).double()
     )
-    back = quaternions.viewpoint(turn)
+    back = quaternions.to_viewpoint(turn)
     torch.testing.assert_close(viewpoint_rotation(back), rotation, rtol=0, atol=8e-15)
     assert back[:, 1].abs().max() <= math.pi / 2
     assert back[:, [0, 2]].abs().max() <= math.pi
@@ -82,7 +83,7 @@ def test_quaternions_are_the_rotations_of_viewpoints():
 def test_viewpoints_at_the_poles_and_borders_turn_back(angles):
     rotation = viewpoint_rotation(double(angles))
     for turn in (quaternions.of_viewpoint(double(angles)), quaternions.of_matrix(rotation)):
-        back = quaternions.viewpoint(turn)
+        back = quaternions.to_viewpoint(turn)
         assert back[1].abs() <= math.pi / 2
         torch.testing.assert_close(viewpoint_rotation(back), rotation, rtol=0, atol=4e-15)
 

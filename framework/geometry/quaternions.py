@@ -57,7 +57,7 @@ def of_viewpoint(angles: Float[Tensor, "... 3"]) -> Quaternions:
     )
 
 
-def viewpoint(turn: Quaternions) -> Float[Tensor, "... 3"]:
+def to_viewpoint(turn: Quaternions) -> Float[Tensor, "... 3"]:
     """Return azimuth, elevation and tilt of the rotation with quaternion `turn`, radians.
 
     Azimuth and tilt are in [-π, π], the elevation is in [-π/2, π/2]. At an elevation of ±π/2 many viewpoints have the
