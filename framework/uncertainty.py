@@ -152,6 +152,23 @@ def held_out(predictor: Predictor, batch: Batch) -> Iterator[None]:
         wrapper.rows = None
 
 
+class FollowsTraining(ABC):
+    """Additional base class of a wrapper that reads the weights while they are trained, such as an average of weights.
+
+    What it collects are buffers, so that checkpoints store it, and a resumed training continues with it. The weights of
+    the last epoch must be kept (trainer.keep=last), and training must not stop early (trainer.patience=null).
+    """
+
+    @abstractmethod
+    def after_epoch(self, epoch: int, epochs: int) -> None:
+        """Read the present weights at the end of a training epoch, before its checkpoint is written.
+
+        Args:
+            epoch: number of the epoch, from 0. A resumed training may repeat the epoch of its checkpoint.
+            epochs: planned number of epochs.
+        """
+
+
 class ReadsTraining:
     """Additional base class of a wrapper whose `calibrate` reads the training split too, to fit a posterior of weights.
 

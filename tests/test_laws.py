@@ -207,6 +207,7 @@ NOT_IN_THE_THESIS = {
     "uncertainty/conformal",
     "uncertainty/folds",
     "uncertainty/laplace",
+    "uncertainty/swag",
 }
 """Plugin folders whose methods and data the thesis does not have; their pages do not compare with it."""
 

@@ -18,7 +18,7 @@ from framework.reports.report import report_test
 from framework.runs.run import open_run
 from framework.runs.session import add_test_parts, calibrate, for_trained
 from framework.target import Target
-from framework.uncertainty import SelfTraining, SeveralModels, self_training
+from framework.uncertainty import FollowsTraining, SelfTraining, SeveralModels, self_training
 
 FEW = 2
 """Number of samples with which uncertainty wrappers are tried before they are fitted."""
@@ -80,6 +80,11 @@ def resolve_wrappers(wrappers: Mapping[str, Any]) -> list[dict[str, Any]]:
             raise ConfigError(
                 f"uncertainty={part['name']} trains several models, but a checkpoint holds one. Train the wrapper with "
                 "mode=train, or join separately trained models with mode=combine mode.members=[...]."
+            )
+        if issubclass(load("uncertainty", part["name"]), FollowsTraining):
+            raise ConfigError(
+                f"uncertainty={part['name']} collects weights during training, but a checkpoint holds those of one "
+                "epoch. Train the wrapper with mode=train."
             )
     return resolved
 

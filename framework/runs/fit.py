@@ -28,6 +28,7 @@ from framework.training.cached_features import CachedFeatures, fits
 from framework.training.checkpoint import WholeCheckpoints
 from framework.training.fitting import fit_at_once, mean_loss
 from framework.training.module import (
+    FollowTraining,
     KeepCheckpoints,
     LoadedBatches,
     LogMetrics,
@@ -220,6 +221,7 @@ def _trainer(run: Run, keep: KeepCheckpoints, console: Console) -> pl.Trainer:
     patience = chosen.get("patience")
     callbacks: list[pl.Callback] = [
         LogMetrics(run.tracker, chosen.get("log_every_steps") or 10),
+        FollowTraining(),
         keep,
         StopAtBatch(run.stopper, keep),
     ]

@@ -64,7 +64,14 @@ from framework.storage.progress import output
 from framework.target import Target
 from framework.tracking.run_info import MODEL
 from framework.training.batches import Batches, require_targets, track_batches
-from framework.uncertainty import ReadsTraining, SelfTraining, reading_training, remarks, self_training
+from framework.uncertainty import (
+    FollowsTraining,
+    ReadsTraining,
+    SelfTraining,
+    reading_training,
+    remarks,
+    self_training,
+)
 
 if TYPE_CHECKING:  # a metric imports torchmetrics, which predictions do not need
     from framework.metric import Metric
@@ -226,6 +233,7 @@ def for_training(config: Config) -> Session:
             f"{type(reader).__name__} reads the training split of the model that it wraps, but "
             f"{type(trains_itself).__name__} trains models on parts of it. Leave one of the two out of uncertainty."
         )
+    _require_whole_training(predictor, config)
     if not learns(predictor) and not resumed:
         _refuse_training(config, "no part of this model learns by gradient")
     if objectives and not learns(predictor):
@@ -254,6 +262,31 @@ def refuse_unread_outliers(config: Config, parts: Resolved) -> None:
     override = config.first_override("outliers")
     if override and not metrics_reading_outliers(parts):
         refuse_idle(config.folder, idle_sentence(override, "no metric of this run reads outliers"))
+
+
+def _require_whole_training(predictor: Predictor, config: Config) -> None:
+    """Refuse settings with which a wrapper of class `FollowsTraining` would not see the training to its end.
+
+    Raises:
+        ConfigError: Training may stop early, keeps the weights of another epoch than the last, or has no planned number
+            of epochs; or a wrapper trains its models itself.
+    """
+    wrapper = next((part for part in predictor.modules() if isinstance(part, FollowsTraining)), None)
+    if wrapper is None:
+        return
+    name, trainer = type(wrapper).__name__, config.settings.trainer
+    if self_training(predictor) is not None or not learns(predictor):
+        raise ConfigError(
+            f"{name} collects weights after each epoch of a training by gradient, but this model is trained in another "
+            "way. Leave one of the two out."
+        )
+    if trainer.get("keep") != "last" or trainer.get("patience") or (trainer.get("max_epochs") or -1) < 1:
+        raise ConfigError(
+            f"{name} collects the weights of the last epochs, so that training must not stop early and must keep its "
+            f"last weights. Got trainer.keep={trainer.get('keep')}, trainer.patience={trainer.get('patience')} and "
+            f"trainer.max_epochs={trainer.get('max_epochs')}. Set trainer.keep=last trainer.patience=null, and a "
+            "number of epochs."
+        )
 
 
 def _refuse_training(config: Config, why: str) -> None:

@@ -25,7 +25,7 @@ from framework.tracking.tracker import Tracker
 from framework.training.batches import Batches
 from framework.training.ranks import Share, WholeBatch, gather_rows, rank_share, sum_over_ranks
 from framework.training.schedules import make_schedule, smooth_factor, update_plateaus
-from framework.uncertainty import outermost, own_batches
+from framework.uncertainty import FollowsTraining, outermost, own_batches
 
 OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
     "adam": torch.optim.Adam,
@@ -332,6 +332,20 @@ class NoProfiler(PassThroughProfiler):
     def profile(self, action_name: str) -> Any:
         """Return a context without any effect."""
         return self._nothing
+
+
+class FollowTraining(BatchCallback):
+    """Callback that calls the wrappers of class `FollowsTraining` after each epoch.
+
+    It must precede `KeepCheckpoints`, whose checkpoints store what the wrappers collect.
+    """
+
+    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Let the wrappers read the weights."""
+        assert isinstance(pl_module, Training) and trainer.max_epochs is not None
+        for module in pl_module.predictor.modules():
+            if isinstance(module, FollowsTraining):
+                module.after_epoch(trainer.current_epoch, trainer.max_epochs)
 
 
 class KeepCheckpoints(BatchCallback):

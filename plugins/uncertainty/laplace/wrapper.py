@@ -202,12 +202,13 @@ class Laplace(Uncertainty, ReadsTraining):
             return self._cached[1]
         vectors = [buffer for name, buffer in self.named_buffers(recurse=False) if name.startswith("vectors")]
         state = [self.precision, self.eigenvalues, *vectors]
-        key = (self.samples, *((id(part), part._version) for part in state))
+        key = (self.samples, *((id(part), part._version, part.dtype, part.device) for part in state))
         if self._cached is None or self._cached[0] != key:
             deviations = None
             if self.precision.isfinite():
                 doubles = [part.double() for part in state]
-                noise = weight_noise(self.samples, len(self.eigenvalues)).to(self.precision.device)
+                draws = [weight_noise(draw, len(self.eigenvalues)) for draw in range(self.samples)]
+                noise = torch.stack(draws).to(self.precision.device)
                 eigen = Eigen(doubles[1], tuple(doubles[2:]))
                 deviations = draw_deviations(eigen, doubles[0], noise, self.shape)
             self._cached = (key, deviations)
