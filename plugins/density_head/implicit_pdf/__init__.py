@@ -1,0 +1,1 @@
+"""Density of rotations by a network of features and rotation, normalised on a grid (Murphy et al. 2021)."""
