@@ -204,6 +204,7 @@ NOT_IN_THE_THESIS = {
     "metric/pose_error",
     "metric/prediction_set",
     "metric/risk_coverage",
+    "uncertainty/batch_ensemble",
     "uncertainty/conformal",
     "uncertainty/folds",
     "uncertainty/laplace",
