@@ -85,11 +85,15 @@ class Gaussian(Symmetric):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log-density, nats, (*sample, *batch)."""
+        return self.each_log_prob(value).sum(-1)
+
+    def each_log_prob(self, value: Tensor) -> Tensor:
+        """Return the log-density of each number given the previous ones, nats, shaped like `value`."""
         residual = value - self.location
         if self.coefficients is not None:
             residual = residual - _times(self.coefficients, residual)
         standard = residual / self.scale
-        return -(standard.square() / 2 + self.scale.log() + math.log(2 * math.pi) / 2).sum(-1)
+        return -(standard.square() / 2 + self.scale.log() + math.log(2 * math.pi) / 2)
 
     def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         """Return samples, (*sample, *batch, *event), differentiable in the parameters."""

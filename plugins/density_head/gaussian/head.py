@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import hardtanh, mse_loss
 
 from framework.density_head import DensityHead
+from framework.errors import ConfigError
 from framework.heads.parameters import require_finite, require_validation
 from framework.heads.scales import scale_of_raw
 from framework.heads.unit import Unit
@@ -37,11 +38,17 @@ class GaussianHead(DensityHead):
         scale: source of the standard deviations.
         covariance: "diagonal": independent numbers; "full": with regression coefficients of each number on the previous
             ones.
+        balance: β of Seitzer et al. 2022 for `scale="predicted"`: the gradient of each number, not the loss, is
+            multiplied by its scale to the power 2β. With 0 (the likelihood alone) a mean is learned more slowly the
+            wider its scale is. With 1 all means are learned as with squared error.
         floor: smallest σ, in the same unit as the raw parameters; it prevents ever narrower densities around training
             values.
+
+    Raises:
+        ConfigError: `balance` is set although no scale is predicted.
     """
 
-    bibtex = "nix1994estimating"
+    bibtex = "nix1994estimating, seitzer2022pitfalls"
 
     scale: Tensor
     coefficients: Tensor
@@ -52,13 +59,20 @@ class GaussianHead(DensityHead):
         *,
         scale: Literal["predicted", "fixed"] = "predicted",
         covariance: Literal["diagonal", "full"] = "diagonal",
+        balance: Annotated[float, Field(ge=0, le=1)] = 0.0,
         floor: Annotated[float, Field(ge=SMALLEST_SCALE, le=1.0)] = 1e-4,
     ) -> None:
         super().__init__()
         target.require("real", by="density_head gaussian")
         self.numbers = len(target.names)
         self.floor = floor
+        self.balance = balance
         self.predicted = scale == "predicted"
+        if balance and not self.predicted:
+            raise ConfigError(
+                f"density_head.balance is {balance:g}, but it has no effect with scale=fixed, where all means are "
+                "learned by squared error. Leave balance out, or set scale=predicted."
+            )
         self.full = covariance == "full" and self.numbers > 1
         pairs = self.numbers * (self.numbers - 1) // 2 if self.full else 0
         self.size = 2 * self.numbers + pairs if self.predicted else self.numbers
@@ -75,20 +89,22 @@ class GaussianHead(DensityHead):
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Gaussian:
         """Return the density for raw parameters."""
-        raw = require_finite(raw, self.size)
-        mean = self._mean(raw)
-        if not self.predicted:
-            scale = self.scale.to(raw).expand_as(mean)
-            coefficients = self.coefficients.to(raw).expand(*mean.shape, self.numbers) if self.full else None
-        else:
-            scale = self.floor + scale_of_raw(raw[..., self.numbers : 2 * self.numbers])
-            coefficients = self._coefficients(raw[..., 2 * self.numbers :]) if self.full else None
-        return Gaussian(*self.unit.to_target_unit(mean, scale, coefficients))
+        return Gaussian(*self.unit.to_target_unit(*self._parts(raw)))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return the negative log-likelihood of each sample, nats; with `scale="fixed"` it is computed with σ = 1."""
-        if self.predicted:
+        """Return the negative log-likelihood of each sample, nats; with `scale="fixed"` it is computed with σ = 1.
+
+        `balance` changes its gradient, not its value.
+        """
+        if self.predicted and not self.balance:
             return -self(raw).log_prob(target)
+        if self.predicted:
+            mean, scale, coefficients = self._parts(raw)
+            value = self.unit.standardise(target).to(mean)
+            losses = -Gaussian(mean, scale, coefficients).each_log_prob(value)
+            share = scale.detach() ** (2 * self.balance)
+            # the value of the losses and, in the gradient, share times theirs
+            return (losses.detach() + share * (losses - losses.detach())).sum(-1) + self.unit.log_volume
         # σ = 1 here also after calibration. There may be very many numbers, so that few passes over them are made.
         target = self.unit.standardise(target).to(raw)
         mean, target = torch.broadcast_tensors(self._mean(require_finite(raw, self.size)), target)
@@ -110,6 +126,18 @@ class GaussianHead(DensityHead):
         scale, coefficients = fit(residual)
         self.scale.copy_(scale.clamp(self.floor, WIDEST_SCALE))
         self.coefficients.copy_(coefficients)
+
+    def _parts(self, raw: Float[Tensor, "*batch size"]) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return mean, scale and regression coefficients in the unit of the raw parameters."""
+        raw = require_finite(raw, self.size)
+        mean = self._mean(raw)
+        if not self.predicted:
+            scale = self.scale.to(raw).expand_as(mean)
+            coefficients = self.coefficients.to(raw).expand(*mean.shape, self.numbers) if self.full else None
+        else:
+            scale = self.floor + scale_of_raw(raw[..., self.numbers : 2 * self.numbers])
+            coefficients = self._coefficients(raw[..., 2 * self.numbers :]) if self.full else None
+        return mean, scale, coefficients
 
     def _mean(self, raw: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch number"]:
         # a clamp whose gradient takes one pass, not four

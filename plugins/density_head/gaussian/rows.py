@@ -49,6 +49,15 @@ ROWS = {
         HeadRow("three numbers", THREE, cases=predicted_cases, scale=0.5),
         HeadRow("full covariance", THREE, {"covariance": "full"}, cases=predicted_cases, scale=0.5),
         HeadRow("one spread for all", THREE, {"scale": "fixed", "covariance": "full"}),
+        HeadRow(
+            "balanced",
+            THREE,
+            {"balance": 0.5, "covariance": "full"},
+            scale=0.5,
+            leave_out={
+                "loss gradient": "`balance` weights the gradient of the loss on purpose (test_gaussian.py)"
+            },
+        ),
         HeadRow("least spread 0.1", ONE, {"floor": 0.1}, cases=predicted_cases),
     )
 }

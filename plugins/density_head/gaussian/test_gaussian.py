@@ -123,6 +123,31 @@ def test_other_targets_are_refused(kind):
         build_head({}, Target(kind, ("azimuth", "elevation")))
 
 
+@pytest.mark.parametrize("covariance", ["diagonal", "full"])
+def test_balance_changes_the_gradient_by_the_scale_and_not_the_value(covariance):
+    target = torch.randn(7, 3, dtype=torch.float64)
+    raw = torch.randn(7, build_head({"covariance": covariance}).size, dtype=torch.float64, requires_grad=True)
+    gradients, losses = [], []
+    for balance in (0.0, 0.5, 1.0):
+        head = build_head({"covariance": covariance, "balance": balance}).double()
+        losses.append(head.loss(raw, target))
+        gradients.append(torch.autograd.grad(losses[-1].sum(), raw)[0])
+    scale = build_head({"covariance": covariance}).double()(raw).scale.detach()
+    for loss in losses[1:]:
+        torch.testing.assert_close(loss, losses[0])
+    # the raw parameter of a scale appears in the density of its own number only
+    own = slice(3, 6)
+    torch.testing.assert_close(gradients[1][:, own], gradients[0][:, own] * scale)
+    torch.testing.assert_close(gradients[2][:, own], gradients[0][:, own] * scale.square())
+    if covariance == "diagonal":  # with β = 1, means learn as with squared error (Seitzer et al. 2022)
+        torch.testing.assert_close(gradients[2][:, :3], raw[:, :3].detach() - target)
+
+
+def test_balance_without_predicted_scales_is_refused():
+    with pytest.raises(ConfigError, match=r"balance is 0\.5, but it has no effect with scale=fixed"):
+        build_head({"scale": "fixed", "balance": 0.5})
+
+
 @pytest.mark.parametrize("config", [{"floor": 0.0}, {"scale": "guess"}, {"covariance": "low_rank"}])
 def test_a_config_out_of_range_is_refused(config):
     with pytest.raises(ConfigError, match=r"density_head\."):

@@ -102,7 +102,8 @@ class StudentTHead(DensityHead):
             losses = -StudentT(location, scale, freedom).each_log_prob(value)
         if self.balance:
             share = scale.detach() ** (2 * self.balance)
-            losses = share * losses + ((1 - share) * losses).detach()
+            # the value of the losses and, in the gradient, share times theirs
+            losses = losses.detach() + share * (losses - losses.detach())
         return losses.sum(-1) + self.unit.log_volume
 
     @torch.no_grad()

@@ -1,5 +1,6 @@
 """Contract-test cases: heads of Student's t, with log-densities from a 50-digit reference."""
 
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -9,6 +10,8 @@ import torch
 from framework.density_head import DensityHead
 from framework.target import Target
 from framework.testing.rows import Case, HeadRow
+from plugins.density_head.student_t.density import NORMAL
+from plugins.density_head.student_t.evidential import LEAST_ALPHA, LEAST_EVIDENCE, EvidentialHead
 from plugins.density_head.student_t.head import StudentTHead
 
 ONE = Target("real", ("height",))
@@ -51,6 +54,27 @@ def cases(head: DensityHead) -> Iterator[Case]:
             yield Case(name, raw, value, torch.tensor(log_prob, dtype=torch.float64))
 
 
+def evidential_cases(head: DensityHead) -> Iterator[Case]:
+    """Yield cases with location 0, and every combination of small and large evidence and scales."""
+    assert isinstance(head, EvidentialHead)
+    for raws in itertools.product((-100.0, -1.0, 0.0, 3.0, 1e4), (-100.0, -1.0, 2.0, 1e4), (-9.0, 0.0, 5.0)):
+        raw = torch.zeros(len(OFFSETS), head.size, dtype=torch.float64)
+        for number, part in enumerate(raws, 1):
+            raw[:, number * head.numbers : (number + 1) * head.numbers] = part
+        value = torch.tensor(OFFSETS, dtype=torch.float32).double()
+        value = torch.stack([value.roll(number) for number in range(head.numbers)], -1)
+        with mpmath.workdps(50):
+            nu, alpha, root_beta = (map_of_raw(part) for part in raws)
+            nu, alpha = mpmath.mpf(LEAST_EVIDENCE) + nu, mpmath.mpf(LEAST_ALPHA) + min(alpha, NORMAL / 4)
+            scale = mpmath.mpf(head.floor) + mpmath.sqrt(root_beta**2 * (1 + nu) / (nu * alpha))
+            log_prob = [float(exact(row, scale, 2 * alpha)) for row in value.tolist()]
+        yield Case(f"r = {raws}", raw, value, torch.tensor(log_prob, dtype=torch.float64))
+
+
+PENALISED: dict[str, str] = dict.fromkeys(
+    ("loss gradient", "loss is least for its own density"),
+    "the penalty of wrong evidence is a part of the gradient only (test_evidential.py)",
+)
 WEIGHTED = {"loss gradient": "`balance` weights the gradient of the loss on purpose (test_student_t.py)"}
 ROWS = {
     "student_t": (
@@ -60,5 +84,9 @@ ROWS = {
         HeadRow(
             "heavy tails", ONE, {"degrees_of_freedom": 2.5, "floor": 0.1}, cases=cases, leave_out=WEIGHTED
         ),
-    )
+    ),
+    "evidential": (
+        HeadRow("one number", ONE, cases=evidential_cases, leave_out=PENALISED),
+        HeadRow("two numbers", TWO, {"evidence_weight": 0.0}, cases=evidential_cases, scale=0.5),
+    ),
 }
