@@ -78,13 +78,13 @@ def use_onnx(predictor: Predictor, shape: Sequence[int], dtype: torch.dtype) -> 
     if _trains(predictor, probe):
         return 0
     count = 0
-    kept = {
+    torch_only = {
         part
         for wrapper in predictor.modules()
         if isinstance(wrapper, Uncertainty) and wrapper.varies_weights
         for part in wrapper.modules()
     }
-    for module in (module for module in list(predictor.modules()) if module not in kept):
+    for module in (module for module in list(predictor.modules()) if module not in torch_only):
         trained = next(module.parameters(), None) is not None
         if isinstance(module, Model) and not isinstance(module.head, Fitted) and trained:
             network = _converted(nn.Sequential(module.encoders, module.projection), probe)

@@ -115,11 +115,11 @@ class Laplace(Uncertainty, ReadsTraining):
         deviations: Float[Tensor, "sample raw feature"],
     ) -> Distribution:
         change = torch.einsum("bf,srf->bsr", features, deviations.to(features))
-        drawn = raw.unsqueeze(1) + change.to(raw)
+        raws = raw.unsqueeze(1) + change.to(raw)
         if isinstance(self.model, Model):
-            components: Distribution = self.model.head(drawn)
+            components: Distribution = self.model.head(raws)
         else:
-            components = Stacked([self._density(inputs, part) for part in drawn.unbind(1)])
+            components = Stacked([self._density(inputs, part) for part in raws.unbind(1)])
         return equal_mixture(components, self.model, inputs.device)
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
@@ -223,8 +223,8 @@ class Laplace(Uncertainty, ReadsTraining):
         else:
             calls: list[tuple[Tensor, Tensor]] = []
 
-            def record(_: nn.Module, given: tuple[Any, ...], output: Any) -> None:
-                calls.append((given[0], output))
+            def record(_: nn.Module, arguments: tuple[Any, ...], output: Any) -> None:
+                calls.append((arguments[0], output))
 
             hook = layer.register_forward_hook(record)
             try:

@@ -176,14 +176,14 @@ class Swag(Uncertainty, FollowsTraining):
             yield
             return
         parameters = self._parameters_by_name()
-        kept = {name: parameter.data for name, parameter in parameters.items()}
+        own_weights = {name: parameter.data for name, parameter in parameters.items()}
         try:
             for name, part in self._by_name(self.mean).items():
                 parameters[name].data = part.to(parameters[name])
             yield
         finally:
             for name, parameter in parameters.items():
-                parameter.data = kept[name]
+                parameter.data = own_weights[name]
 
 
 class _Chain(nn.Module):
