@@ -284,7 +284,7 @@ def in_cell(text: str) -> str:
 
 
 def escape(text: str) -> str:
-    """Return a text in which a `<` outside of inline code is no beginning of an HTML element."""
+    """Return a text in which a `<` outside of inline code is not a beginning of an HTML element."""
     return "".join(
         part if part.startswith("`") else part.replace("<", "&lt;") for part in re.split(r"(`[^`]*`)", text)
     )

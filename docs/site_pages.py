@@ -3,7 +3,7 @@
 The site shows pages from the whole repository. READMEs of plugins become pages of methods, and the pages of results
 stand under the same path as in the repository. Three kinds of links are translated to links between pages of the site:
 relative links to any file of the repository; `site:<page>`, a page of the site; and `repo:<path>`, a file of the
-repository. A linked file that is no page, such as a figure or a config, is copied into the site.
+repository. A linked file that is not a page, such as a figure or a config, is copied into the site.
 """
 
 import posixpath
@@ -56,7 +56,7 @@ def tutorials() -> list[Path]:
 
 
 def generated() -> Iterator[tuple[str, str, str]]:
-    """Yield page, text, and the file to which its relative links refer, for each page that is no file of docs/."""
+    """Yield page, text, and the file to which its relative links refer, for each page that is not a file of docs/."""
     for source, target in pages().items():
         if not source.startswith(("docs/", "plugins/", "README")):
             yield target, (ROOT / source).read_text(encoding="utf-8"), source

@@ -169,8 +169,8 @@ A training step is the forward and the backward pass of {BATCH} clouds (syntheti
 thread. The step is measured after {TRAINED} steps of training. Steps with "every point" and with the "attaining
 points" run in each of {ROUNDS} interleaved rounds. The columns are:
 - ms: processor time of a training step, median over the rounds;
-- time ratio: processor time of a step in which every point has a gradient, divided by that of a step in which only
-  the points that attain a maximum have one, median over the rounds;
+- time ratio: processor time of a step in which every point has a gradient, divided by the time of a step in which
+  only the points that attain a maximum have one, median over the rounds;
 - MB: memory that autograd stores until the backward pass, without the parameters, median over the rounds;
 - gradient error: largest relative error of the gradient with respect to a parameter of the network, over all rounds.
   The reference is the gradient in float64 through every point. Parameters whose gradient consists only of rounding

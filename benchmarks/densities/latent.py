@@ -375,7 +375,7 @@ def main() -> None:
         "compares three quasi-random sequences, each with a random shift, with the same number of independent "
         "points. A number says by which factor the variance of an estimated integral is smaller than with "
         'independent points. It is the geometric mean over five smooth integrands; the columns "worst" give the '
-        'smallest factor of the five. "Dimensions" are those of z.\n\n'
+        'smallest factor of the five. "Dimensions" are the dimensions of z.\n\n'
         f"{table.markdown(gains, {key: key for key in gains[0]})}\n\n"
         f"{machine('torch')}\n"
     )

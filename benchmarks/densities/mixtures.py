@@ -154,7 +154,7 @@ def main() -> None:
             f"computed for {VALUES:,} pairs of a value and a component, and times are for one pair. `ours` is "
             "`Mixture` with the densities of the heads `von_mises` and `gaussian`, as the mixture head makes it, and "
             "`torch` is MixtureSameFamily of torch.distributions. Both are constructed in every call. The gradients "
-            "are those with respect to the weights, the means and the widths of the components.",
+            "are with respect to the weights, the means and the widths of the components.",
             "",
             *density_table(),
             "",
@@ -162,9 +162,9 @@ def main() -> None:
             "",
             "The table shows the time to find the mode of one mixture of K components of different widths. With "
             "2,048 components or more, the density at the modes of all components is interpolated, in time K log K. "
-            "The column `all pairs` is the time to compute only this density for all pairs of components, without "
-            "the ascent from the highest of them. The last column is not negative if the mode is at least as high as "
-            "the mode of each component.",
+            "The column `all pairs` is the time to compute this density for all pairs of components, without the "
+            "search uphill that follows. The last column is 0 or more if the found mode is at least as high as the "
+            "mixture is at the mode of each component.",
             "",
             *mode_table(),
             "",

@@ -340,15 +340,15 @@ SPEEDS = {
     "## Speed": (
         speed_table,
         "The log-density of independent angles was computed by the class `VonMises` of the project (ours) and by "
-        "torch.distributions.VonMises (torch), each constructed in every call. The gradients are those with respect "
-        "to the mean μ and the concentration κ.",
+        "torch.distributions.VonMises (torch), each constructed in every call. The gradients are with respect to the "
+        "mean μ and the concentration κ.",
     ),
     "## First call": (time_first_calls, ""),
     "## Sampling": (
         sampling_table,
         f"For each concentration κ, {COUNT:,} samples from a von Mises density were compared with the distribution "
         "function by a Kolmogorov-Smirnov (KS) test. A distance above 1.4e-3 is significant at the level of 5 %, and "
-        "p is the p-value. The times to draw the samples are those in float64. A dash means that the sampler of "
+        "p is the p-value. The times to draw the samples were measured in float64. A dash means that the sampler of "
         "torch does not terminate, or is wrong, at this κ.",
     ),
     "## Coverage": (time_coverage, ""),
@@ -380,7 +380,7 @@ def report() -> str:
             "# The von Mises functions: accuracy and speed",
             "",
             "This page shows how accurate the project's von Mises functions are, compared with references of 50 or 60 "
-            "digits, and how fast they are, compared with those of torch.",
+            "digits, and how fast they are, compared with torch's functions.",
             "",
             "## Accuracy",
             "",
@@ -399,7 +399,7 @@ def report() -> str:
             "Two further functions of von Mises densities were compared with references. The largest relative error "
             "of the concentration κ that is computed from moments (eq. 3.5), for κ from 1e-8 to 1e12, is "
             f"{largest_error_from_moments():.1e}. The largest difference of the distribution function at κ = 1e30 "
-            f"from that of a normal density is {largest_error_of_cdf():.1e}.",
+            f"from the distribution function of a normal density is {largest_error_of_cdf():.1e}.",
             "",
             "## Entropy of mixtures",
             "",

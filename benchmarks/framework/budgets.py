@@ -190,14 +190,14 @@ Does the setting that `framework.load(run, budget=...)` chooses meet its limit i
 
     python -m benchmarks.framework.budgets
 
-Each model is trained shortly on synthetic data, and gets two limits: the middle between the run times of its stored and
-its cheapest setting, and the middle between their errors. `milliseconds` are those of a sample in a batch of
-{batch} on one thread: density, point prediction and error measure. After the choice, run time and error are measured
-again, by code of this script: times are medians over five interleaved rounds (least to largest round), and errors are
-those of at most {samples} validation samples, with other random numbers than those of the choice. *new / limit* is this
-measurement divided by the limit (for an error of any sign: one plus the excess as a share of the limit); the largest is
-{worst:.2f}. *faster* compares with the stored setting in the same rounds; *test error* is that of the stored and of the
-chosen setting on the test split.
+Each model is trained shortly on synthetic data, and gets two limits: the middle between the run times of its stored
+and its cheapest setting, and the middle between their errors. `milliseconds` limits the time of one sample in a batch
+of {batch} on one thread: density, point prediction and error measure. After the choice, run time and error are
+measured again, by code of this script: times are medians over five interleaved rounds (least to largest round), and
+errors are means over at most {samples} validation samples, with other random numbers than the choice used. *new /
+limit* is this measurement divided by the limit (if errors can be negative: one plus the excess as a share of the
+limit); the largest is {worst:.2f}. *faster* compares with the stored setting in the same rounds; *test error* is the
+error of the stored and of the chosen setting on the test split.
 
 | model | measure | limit | stored → chosen | ms per sample | validation error | new / limit | faster | test error |
 |---|---|---|---|---|---|---|---|---|

@@ -206,8 +206,9 @@ def page(results: dict[str, Any]) -> str:
             f"| the same, whole command with its start | "
             f"{median_and_range([CLOUDS / seconds for seconds in wall], 4)} | {median_and_range(whole, 2)} |",
             "",
-            f"The share is that of {CORES} × the rate of one core. Compared with {CORES} processes of the encoder at "
-            f"once, which share the memory of the machine, the jobs reach {median_and_range(ratio_together, 2)}.",
+            f"The last column is the share of {CORES} × the rate of one core. Compared with {CORES} processes of the "
+            f"encoder at once, which share the memory of the machine, the jobs reach "
+            f"{median_and_range(ratio_together, 2)}.",
             "",
             f"Before and after the encoding, the command takes {median_and_range(beyond, 2)} s (imports, composition "
             f"of the config, end of the sweep). This is as long as the encoding of {CLOUDS:,} clouds itself. With a "

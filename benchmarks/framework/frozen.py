@@ -177,8 +177,9 @@ def main() -> None:
     text = (
         "# Frozen models: run time on one core\n\n"
         "This page compares the run time of a classifier in several forms: as a PyTorch model and in forms that are "
-        "meant for deployment. `frozen` is the form that this project deploys (`framework.freeze`). The benchmark "
-        "shows how much time it saves on one core.\n\n"
+        "meant for deployment. `frozen` is the form that this project deploys (`framework.freeze`): compiled code "
+        "computes one sample, and ONNX Runtime computes two samples or more. The benchmark shows how much time "
+        "`frozen` saves on one core.\n\n"
         "The classifier is a multilayer perceptron with 512 inputs, two hidden layers of 400 units, batch norm, "
         "dropout and 40 classes. In the rows `classify` its input is 512 features. In the rows `encode and classify` "
         "its input is a point cloud of 2048 points, and an encoder computes the 512 features with a basis point set. "
@@ -188,8 +189,8 @@ def main() -> None:
         f"{ROUNDS} rounds, with the smallest and the largest one in brackets, and each round contributes its shortest "
         "call. In a round the forms of the classifier run one after the other. `ms a sample` is this time divided by "
         "the batch size. `speed ratio` says how many times as fast the form is as the PyTorch model in the first row "
-        "with the same task and batch size. `of the best` is the time divided by that of the fastest form other than "
-        f"`frozen`; the project requires at most {MOST} of `frozen` in the rows `classify`.\n\n"
+        "with the same task and batch size. `of the best` is the time divided by the time of the fastest form other "
+        f"than `frozen`; the project requires at most {MOST} of `frozen` in the rows `classify`.\n\n"
         "| task | batch size | form | ms a call | ms a sample | speed ratio | of the best |\n"
         "|---|---|---|---|---|---|---|\n"
         + "\n".join(lines)

@@ -198,8 +198,8 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         "`trainer.precision=bf16-mixed`. The value `auto` means `bf16-mixed` on a processor that multiplies bfloat16 "
         "numbers fast.",
         "",
-        "Wall time and processor time in the table are those of the main job, the whole command with all its "
-        "processes. The times of the parts are differences of times in the journal of the run. Each cell is the "
+        "Wall time and processor time in the table include the whole command with all its processes. The times of "
+        "the parts are differences of times in the journal of the run. Each cell is the "
         "median over the seeds (least to largest), which are the rounds: in each round, the versions run one after "
         "the other. Errors are the mean over the seeds ± their standard deviation.",
     ]

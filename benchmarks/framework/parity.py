@@ -195,9 +195,9 @@ def write(lines: Sequence[Mapping[str, str]]) -> None:
         "inputs, as a share of the largest number in a row; 1e-5 is allowed. Log-densities differ by at most "
         f"{worst['log-density']:.1e} for random inputs, as a share of max(1, |log-density|); 1e-4 is allowed.",
         "",
-        "Differences for extreme inputs are those of rounding in float32, and depend on the weights: where a number is "
-        "close to 0, the rounding of the large numbers in the layers is a large share of it. So a network with other "
-        "weights or widths may be refused; [deployed.md](deployed.md) has such a model.",
+        "Differences for extreme inputs come from rounding in float32, and depend on the weights: where a result is "
+        "close to 0, the rounding errors of the large numbers in the layers are a large share of the result. So "
+        "`mode=export` may refuse a network with other weights or widths; [deployed.md](deployed.md) has such a model.",
         "",
         "## Refused models",
         "",

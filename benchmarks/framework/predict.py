@@ -188,7 +188,7 @@ This page shows how long commands take before they begin their work, and how lon
 
 Every time in the tables is the median of five rounds, with the smallest and the largest round in brackets. Each
 measurement is a new process with one thread. In each round, the commands of a table run one after the other. The
-processor time is that of the command and of its child processes. `before` is commit 950f55d, whose commands run in the
+processor time includes the child processes of the command. `before` is commit 950f55d, whose commands run in the
 same rounds.
 
 The command that measures this page is `python -m benchmarks.framework.predict --before <folder with commit 950f55d>`.

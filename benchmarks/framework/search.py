@@ -243,7 +243,7 @@ def introduction() -> Sequence[str]:
         "single measurement, while another trial runs, differs by more than 5 %. A point beats another if it is "
         f"better in one of the two and not worse in the other; run times within {100 * TIME_NOISE:g} % count as "
         "equal, and losses are compared exactly. The dominated area is the area below the worst point, in nats "
-        "times the logarithm of the run time, divided by that of all trials together; higher is better.",
+        "times the logarithm of the run time, divided by the dominated area of all trials together; higher is better.",
         "",
         "A grid contains the ends of the intervals, which a search hardly ever draws. A grid therefore has an "
         "advantage where the best settings are at an end, as a learning rate of 0.025 and a dropout rate of 0 are "

@@ -236,7 +236,7 @@ def main() -> None:
             "PyTorch loop. The difference is what the framework itself costs.",
             "",
             "The column `framework's command` is the training of `python -m framework` with the settings in the first "
-            f"column and `{' '.join(QUIET)}`. Its times are those in the journal of the run: the time between the "
+            f"column and `{' '.join(QUIET)}`. Its times are read from the journal of the run: the time between the "
             "first and the last logged step, divided by the number of steps. They include everything that the "
             "framework does at a step and between two epochs, such as reading batches, callbacks, schedules and the "
             "journal. `plain loop, plain model` is a PyTorch loop with a network and a loss that are written in plain "

@@ -56,7 +56,7 @@ def main() -> None:
             "the version at the date of this page.",
             "",
             "The first two columns of the table are differences between the run with `logger=mlflow` and the run "
-            "with `logger=none`. Processor time is that of the command with all its processes. The last column is "
+            "with `logger=none`. Processor time includes all processes of the command. The last column is "
             "the time between the last line of the journal, which says that the run has finished, and the end of the "
             f"command. Each number is the median of {ROUNDS} rounds (least to largest); in each round, all runs are "
             "made one after the other.",

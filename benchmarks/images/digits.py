@@ -315,8 +315,8 @@ of the true angle, and within 45° of the opposite angle.
 | {100 * classes["accuracy"]:.2f} ± {100 * classes["accuracy_sem"]:.2f} | {-classes["log_likelihood"]:.3f} | {
             classes["ece"]:.4f} | {classes["milliseconds_per_sample"]:.2f} | {_minutes("classes"):.1f} |
 
-± is the standard error over the test images. The time is that of the whole command with one thread, while other work
-ran on the machine.
+± is the standard error over the test images. The time is for the whole command with one thread, while other work ran
+on the machine.
 
 ## Corrupted test images
 

@@ -180,7 +180,8 @@ def main() -> None:
         "",
         "The columns `vertices` to `vertices, textured` hold two numbers for each group of parameters: the cosine of "
         "the angle between the gradient and the reference (central differences), and the length of the gradient "
-        "divided by that of the reference. Both numbers are 1 for an exact gradient. `vertices` are 8 deformations "
+        "divided by the length of the reference. Both numbers are 1 for an exact gradient. `vertices` are 8 "
+        "deformations "
         "of the body, `colors` are 3 changes of its colours, and `rotation`, `translation` and `focal` are "
         "parameters of the camera. For `texture` and `vertices, textured` the body has a smooth texture instead of "
         "colours: 3 changes of the texture, and the 8 deformations. `soft` draws no textures.",

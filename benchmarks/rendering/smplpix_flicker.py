@@ -219,13 +219,13 @@ def report(run: str, file: Path) -> str:
             "In the table, `mean difference` is the mean difference between an image and the warped previous image, "
             "over the pixels visible in both, all pairs of images and all people, on the scale of 0 to 255 of sRGB "
             "values. `SD over people` shows by how much this mean differs from person to person. `95th percentile` "
-            "is over the same pixels as the mean. The last column is the mean divided by that of the photographs. "
+            "is over the same pixels as the mean. The last column is the mean divided by the mean of the photographs. "
             "The rows `mesh` are renders of the registered mesh with 1 or 4 × 4 samples a pixel.",
             "",
             "The photographs show how much of the difference between consecutive images is present in true images. "
             "Interpolation blurs fine patterns, cloth moves differently from the registered body, and the light "
             "changes when the body turns. A mesh whose vertices have fixed colours shows less of all three. Its "
-            "difference may therefore be smaller than that of the photographs.",
+            "difference may therefore be smaller than the difference between photographs.",
             "",
             "| way to draw | mean difference | SD over people | 95th percentile | mean relative to photographs |",
             "|---|---|---|---|---|",

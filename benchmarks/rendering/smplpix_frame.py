@@ -73,7 +73,7 @@ def main() -> None:
         f"A time of an image is the processor time of one thread: the median of {ROUNDS} rounds, with the smallest "
         "and the largest one in brackets. In a round the settings are measured one after the other. `crop=trained` "
         "computes only the box of the body. `speed ratio` is the time of `precision=float32, crop=trained` divided "
-        "by that of the row."
+        "by the time in the row."
         "\n\n"
         "| settings of the renderer | time, ms | speed ratio |\n|---|---:|---:|\n"
         + "\n".join(lines)

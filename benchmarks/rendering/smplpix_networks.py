@@ -277,7 +277,7 @@ def frames_section() -> str:
             *lines,
             "",
             "The project requires the following run times of the networks `unet` and `slim`. A speed ratio is the "
-            "time of the slower way to compute an image divided by that of the faster way.",
+            "time of the slower way to compute an image divided by the time of the faster way.",
             "",
             f"| quantity at {SIZES[0][0]} × {SIZES[0][1]} pixels | measured | requirement | result |",
             "|---|---|---|---|",
@@ -314,7 +314,7 @@ def report() -> str:
             "",
             "Both networks, `unet` and `slim`, were trained for about the same time, with seed 0. They were tested "
             "on 96 images of 256 × 192 pixels, which show 16 generated people who are not in the training data. "
-            "`processor time` is that of the whole run on one core. The columns `inside` count only the pixels of "
+            "`processor time` is the time of the whole run on one core. The columns `inside` count only the pixels of "
             "the subject.",
             "",
             "| network | arguments of the training | processor time, minutes | PSNR, dB | PSNR inside, dB | SSIM | "

@@ -115,7 +115,7 @@ def report() -> str:
             "an image. It compares the compiled code with an implementation in plain PyTorch, for four numbers of "
             "points.",
             "",
-            f"The projected points are those of a synthetic body, in float32, and the image has {HEIGHT} rows × "
+            f"The projected points belong to a synthetic body, in float32, and the image has {HEIGHT} rows × "
             f"{WIDTH} columns. A time is the processor time of one call on one thread, in ms: the lowest of {ROUNDS} "
             "medians. It includes the check of the encoder's input. All implementations gave bitwise equal images in "
             "this run.",
@@ -140,7 +140,7 @@ def report() -> str:
             f"The last table compares one and two threads for the projection of a batch of {BATCH} point clouds. A "
             "time is wall time without the check of the input: the shortest call within half a second. While this "
             f"was measured, {os.getloadavg()[0]:.1f} processes were running on the machine on average. `ratio` is the "
-            "time of one thread divided by that of two.",
+            "time with one thread divided by the time with two.",
             "",
             "| points | 1 thread, ms | 2 threads, ms | ratio |",
             "|---|---|---|---|",

@@ -262,10 +262,10 @@ def speed_section(file: Path) -> str:
 fits the spectra of all voxels at once. The model has 11 or 15 parameters. SciPy runs with the tolerance 1e-14 and with
 its default 1e-8. The three columns after the number of parameters hold milliseconds a voxel: the median of {ROUNDS}
 rounds (least to largest). In each round SciPy fits another fifth of the voxels with 1e-14 and a twentieth of the
-voxels with 1e-8, and the batched fit has all voxels. A speed ratio is SciPy's time divided by that of the batched
+voxels with 1e-8, and the batched fit has all voxels. A speed ratio is SciPy's time divided by the time of the batched
 fit. `whole slice` is the time of the batched fit for all voxels.
 
-The last five columns of the table compare the batched fits of the spectra with those of SciPy at the tolerance 1e-14.
+The last five columns of the table compare the batched fits of the spectra with SciPy's fits at the tolerance 1e-14.
 `sum of squares ≤ SciPy's` is the share of voxels where the batched fit is at least as good. `same minimum` is the
 share of voxels where the parameters are well determined and both sums of squares agree. `parameters agree` is the
 share of these where every parameter agrees to 1e-6: the difference is at most 1e-6 of the parameter, or 1e-6 of 1 %
@@ -369,9 +369,9 @@ This table and the figure hold the errors of the ten fitted parameters, five amp
 held-out voxels. An error is the distance from the converged least-squares fit, divided by the standard error of that
 fit. Only parameters that the data determine are counted: the standard error is below {100 * DETERMINED:.0f} % of the
 permitted range, and the parameter is not at the border of this range. `time a voxel` is measured with the whole slice
-at once, except for SciPy. The column `speed ratio to SciPy` is the time of SciPy divided by that of the method. The
+at once, except for SciPy. The column `speed ratio to SciPy` is the time of SciPy divided by the time of the method. The
 last column is the share of errors below one standard error. For the networks of {len(networks)} seeds this share is
-{" / ".join(f"{100 * share:.1f} %" for share in shares)}. The small errors of least squares are no evidence of
+{" / ".join(f"{100 * share:.1f} %" for share in shares)}. The small errors of least squares are not evidence of
 accuracy, because the targets are themselves least-squares fits.
 
 ![Error of the parameters against run time](cest.png)
@@ -401,8 +401,8 @@ other half for the test.
 
 The standard deviation σ that the network predicts for a parameter should increase if a spectrum is unlike the
 training spectra. For this table the held-out spectra were changed: noise with the given standard deviation was added,
-or the lines were shifted along the axis of the offsets. `σ ratio` is the predicted σ divided by that for the
-unchanged spectra, and `error ratio` is the same ratio of the mean absolute errors; both are geometric means.
+or the lines were shifted along the axis of the offsets. `σ ratio` is the predicted σ divided by the predicted σ for
+the unchanged spectra, and `error ratio` is the same ratio of the mean absolute errors; both are geometric means.
 `coverage` is the share of targets in the predicted 90 % intervals. If σ rises less than the error, the coverage
 falls.
 

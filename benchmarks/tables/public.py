@@ -147,8 +147,8 @@ def page() -> None:
         "scikit-learn in its default settings. Both see the same rows.",
         "",
         "Log-likelihoods are means over test rows, 15 % of a table, in nats and in the unit of the target; higher is "
-        f"better. Each is a mean over {SEEDS} random splits, with its standard error. The difference is that of the "
-        "two methods on the same split. For real targets, gradient boosting predicts a normal density with the "
+        f"better. Each is a mean over {SEEDS} random splits, with its standard error. The difference is between the "
+        f"two methods on the same split. For real targets, gradient boosting predicts a normal density with the "
         "standard deviation of the residuals on a tenth of the training rows.",
         "",
         "| table | data | recommended start | gradient boosting | difference | splits won |",

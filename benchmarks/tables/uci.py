@@ -332,14 +332,15 @@ def page(root: Path) -> None:
         "(`experiment=tabular/regression`), with other methods on four real data sets of the UCI repository and their "
         "20 standard splits. One configuration is used for all sets and splits. It was chosen by the likelihood of "
         "left-out training rows, except for the number of epochs: it was raised to 45 after test results of kin8nm "
-        "with 30 epochs (1.319) had been seen, so that the result on kin8nm is not quite independent of its test rows.",
+        "with 30 epochs (1.319) had been seen, so that its result on kin8nm depends a little on the test rows.",
         "",
         "Log-likelihoods are means over the test rows of a split, in nats and in the unit of the target; higher is "
         "better. Each number is a mean over the splits, and ± is its standard error. Splits share rows, so the "
         "standard errors are too small; compare methods by the paired differences. The difference is ours minus the "
-        "other method on the same split. The 90 % region is that of highest density. `MC dropout, published per split` "
-        "are result files of its authors. The peers of scikit-learn predict a normal density whose standard deviation "
-        "is that of the residuals on a tenth of the training rows; NGBoost stops early on such a tenth. "
+        "other method on the same split. The 90 % region is the region of highest density. `MC dropout, published "
+        "per split` "
+        "are result files of its authors. The peers of scikit-learn predict a normal density with the standard "
+        "deviation of the residuals on a tenth of the training rows; NGBoost stops early on such a tenth. "
         "`uci/ensemble` and `uci/mc_dropout` are networks of one layer with 50 units, as in the literature, trained by "
         "this framework.",
         "",
@@ -349,8 +350,9 @@ def page(root: Path) -> None:
         "",
         missed(rows),
         "",
-        "The worst split is the lowest mean log-likelihood of a split. The wall time is that of one command, two runs "
-        "at a time with one thread each. Other programs used the machine at the same time, so that it is an upper "
+        "The worst split is the lowest mean log-likelihood of a split. The wall time is the time of one command; two "
+        "commands ran at a time, with one thread each. Other programs used the machine at the same time, so that it "
+        "is an upper "
         "bound. The time of a prediction is the processor time of a row in a batch of 2000 rows by the frozen model on "
         f"one thread, a median over {TIMED} splits; the last column adds the median of the density. A run trains at "
         f"least 3000 steps and {epochs_of(rows)} epochs.",

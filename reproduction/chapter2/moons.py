@@ -324,7 +324,7 @@ def main() -> None:
         "- **OOD entropy** is the mean entropy of the predictions for outliers, in nats; it is at most 0.693. "
         "**AUROC** is the probability that an outlier has a higher entropy than a test point.\n"
         "- **ms / sample** is the time of one prediction in a batch of 100, measured on one thread while no other "
-        "model runs. The processor time is that of the whole run.\n\n"
+        "model runs. The processor time covers the whole run.\n\n"
         "The number of epochs, the batch size and the learning rate of all methods were chosen such that the two "
         "vanilla networks (128 and 512 units per layer) overfit as in the thesis. The last row of the table combines "
         "several methods. Its settings were chosen on other data of the same generator. An earlier combination (5 "

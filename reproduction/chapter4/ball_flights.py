@@ -347,9 +347,9 @@ def write_results(
         "noise. The physical model has the form of the simulator, and its constants are estimated from the training "
         "windows. The TVAE contains no physics; it falls behind the physical model most where the ball has just "
         "bounced.", "",
-        "For simulated flights, the error of the TVAE divided by that of the physical model is "
+        "For simulated flights, the error of the TVAE divided by the error of the physical model is "
         f"{error_ratios(simulated, 'tvae')}.", "",
-        "For simulated flights, the error of the hybrid divided by that of the physical model is "
+        "For simulated flights, the error of the hybrid divided by the error of the physical model is "
         f"{error_ratios(simulated, 'hybrid')}.", "",
         "The next figure shows 30 sampled flights for each of three windows, and the places where all sampled flights "
         "land.", "",

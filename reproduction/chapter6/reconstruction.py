@@ -270,7 +270,7 @@ def main() -> None:
         "points. The columns are named after the arrangement of the basis points: random in the ball "
         "(`ball_uniform`), hexagonal, a grid trimmed to the ball (`ball_grid`) or a full cubic grid (`grid`).\n\n"
         "The thesis reports that basis point sets have less than half of the error of the occupancy grid up to about "
-        "N = 1e4, that their error is close to that of raw points, and that random and hexagonal arrangements are "
+        "N = 1e4, that their error is close to the error of raw points, and that random and hexagonal arrangements are "
         "best. The table shows ratios of the measured errors (Chamfer distances of reconstructed clouds). Values "
         "between measured lengths N of the encoding are interpolated.\n\n"
         f"{claims_text(rows)}\n\n"
