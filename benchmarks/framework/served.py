@@ -20,7 +20,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -72,17 +72,27 @@ def train_model(kind: str, base: Path) -> tuple[Path, str]:
     return model, json.dumps({"dataframe_records": [{"base64": content, "name": file.name}]})
 
 
-@contextlib.contextmanager
-def start_server(model: Path) -> Iterator[tuple[int, float]]:
-    """Start a server on the loopback device, and yield its port and the seconds until it accepted connections."""
+def free_port() -> int:
+    """Return a port of the loopback device that no program uses at this moment."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    line, environment = get_cmd(str(model), port=port, host="127.0.0.1")  # pyright: ignore[reportArgumentType]
-    quiet = subprocess.DEVNULL
+        return free.getsockname()[1]
+
+
+@contextlib.contextmanager
+def run_server(
+    command: Sequence[str],
+    port: int,
+    folder: Path,
+    environment: Mapping[str, str] | None = None,
+    end: signal.Signals = signal.SIGTERM,
+    quiet: bool = False,
+) -> Iterator[float]:
+    """Run a server in the block, and yield the seconds from its start until it accepted connections."""
+    output = subprocess.DEVNULL if quiet else None
     begin = time.perf_counter()
     process = subprocess.Popen(
-        shlex.split(line), env=environment, cwd=model, stdout=quiet, stderr=quiet, start_new_session=True
+        command, env=environment, cwd=folder, stdout=output, stderr=output, start_new_session=True
     )
     try:
         while True:
@@ -90,10 +100,19 @@ def start_server(model: Path) -> Iterator[tuple[int, float]]:
                 break
             assert process.poll() is None, "The server ended before it accepted a connection."
             time.sleep(0.02)
-        yield port, time.perf_counter() - begin
+        yield time.perf_counter() - begin
     finally:
-        os.killpg(process.pid, signal.SIGKILL)
+        os.killpg(process.pid, end)
         process.wait()
+
+
+@contextlib.contextmanager
+def start_server(model: Path) -> Iterator[tuple[int, float]]:
+    """Start MLflow's server on the loopback device, and yield its port and the seconds that its start took."""
+    port = free_port()
+    line, environment = get_cmd(str(model), port=port, host="127.0.0.1")  # pyright: ignore[reportArgumentType]
+    with run_server(shlex.split(line), port, model, environment, signal.SIGKILL, quiet=True) as seconds:
+        yield port, seconds
 
 
 def response_time(port: int, body: str) -> float:
@@ -133,8 +152,8 @@ def main() -> None:
         "set, with a small model that was trained on generated data. Each request sends one file. The column `start` "
         "is the time from the start of the server until it accepts connections. `first request` is the response time "
         f"of the first request. `later requests` is the median response time of {LATER} further requests. All three "
-        f"are medians over the {STARTS} starts. `ratio` is the time of the first request divided by that of the later "
-        "requests.\n\n"
+        f"are medians over the {STARTS} starts. `ratio` is the time of the first request divided by the time of the "
+        f"later requests.\n\n"
         "| data | start, s | first request, ms | later requests, ms | ratio |\n|---|---|---|---|---|\n"
     )
     where = f"{machine('torch', 'mlflow', 'uvicorn')} Command: `python -m benchmarks.framework.served`."

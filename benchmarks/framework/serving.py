@@ -17,10 +17,7 @@ import os
 import random
 import re
 import shutil
-import signal
-import socket
 import struct
-import subprocess
 import sys
 import time
 from collections import Counter
@@ -34,7 +31,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from benchmarks.commands import carry_out
-from benchmarks.framework.served import QUICK, start_server
+from benchmarks.framework.served import QUICK, free_port, run_server, start_server
 from benchmarks.pages import machine, write_page
 from benchmarks.timing import median_and_range
 from plugins.data.labelled_clouds.rows import ROWS
@@ -144,21 +141,10 @@ def measure(port: int, body: Body, count: int) -> Load:
 @contextlib.contextmanager
 def start_service(folder: Path) -> Iterator[int]:
     """Start the service of an exported model, wait until it accepts connections, and yield its port."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     script = [sys.executable, str(folder / "serve.py"), "--port", str(port)]
-    process = subprocess.Popen(script, cwd=folder, start_new_session=True)
-    try:
-        while True:
-            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=5):
-                break
-            assert process.poll() is None, "The service ended before it accepted a connection."
-            time.sleep(0.02)
+    with run_server(script, port, folder):
         yield port
-    finally:
-        os.killpg(process.pid, signal.SIGTERM)
-        process.wait()
 
 
 def first_wait(port: int, body: Body) -> float:
