@@ -285,7 +285,7 @@ def as_inputs(user_data: Any, shape: tuple[int, ...]) -> Tensor:
     One input becomes a batch of one. Clouds, of shape (points, columns), may have any number of points.
 
     Raises:
-        DataError: `user_data` is no array of numbers, or has another shape.
+        DataError: `user_data` is not an array of numbers, or has another shape.
     """
     expected_shape = (
         "×".join(["any number", str(shape[-1])] if len(shape) == 2 else map(str, shape)) or "one number"

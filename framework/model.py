@@ -61,7 +61,7 @@ class Model(Predictor):
         beside: the encoders of all backbones but the first, for a head with several backbones.
 
     Raises:
-        ConfigError: the last encoder's features are no vector; or, before a direct head, they are not as many as the
+        ConfigError: the last encoder's features are not a vector; or, before a direct head, they are not as many as the
             head reads; or an encoder with trained parameters precedes a head that is fitted at once.
     """
 
@@ -86,8 +86,9 @@ class Model(Predictor):
                 )
             if head.size and math.prod(shape) != head.size:
                 raise ConfigError(
-                    f"{type(head).__name__} reads {head.size:,} numbers per sample, but gets {math.prod(shape):,}, of "
-                    f"shape {tuple(shape)}. Set the sizes of the density head to those of the data."
+                    f"{type(head).__name__} reads {head.size:,} numbers per sample, but its input has "
+                    f"{math.prod(shape):,} numbers, shape {tuple(shape)}. Set the sizes of the density head to the "
+                    "sizes of the data."
                 )
             self.projection: nn.Module = nn.Flatten()
         elif head.direct:
@@ -161,7 +162,7 @@ class Backbones(Encoder):
         sizes: number of raw parameters that each network gives.
 
     Raises:
-        ConfigError: the features of the last encoders are no vectors.
+        ConfigError: the features of the last encoders are not vectors.
     """
 
     bibtex = ""

@@ -195,7 +195,7 @@ def stored_parameters(folder: Path) -> None:
             continue  # no small file: its weights account for 1 GB
         model.write(file, weights)
         with suppress(UserError):  # a data set may miss what travels with a model of its own
-            predicted(file, model.inputs)  # what is imported and compiled once is no part of a case
+            predicted(file, model.inputs)  # what is imported and compiled once is not part of a case
         for place, values in asked:
             for value in values:
                 model.write(file, weights, put(model.config, (*model.place, *place), value))
@@ -392,7 +392,7 @@ def bombs() -> dict[str, tuple[Callable[[], bytes], Callable[[Path], object]]]:
 
 def files(folder: Path) -> None:
     """Read small files that decompress to huge content, with each reader of users' files."""
-    writer = os.fork()  # what writing them takes is no part of a case
+    writer = os.fork()  # what writing them takes is not part of a case
     if writer == 0:
         try:
             for name, (write, _) in bombs().items():

@@ -104,7 +104,7 @@ def test_a_label_of_no_class_is_refused_wherever_it_is_read(label: float, worker
         ),
         (
             ["density_head=wrapped_cauchy", "data.kind=angles", "uncertainty=[temperature]"],
-            "No temperature is known",
+            "cannot be changed",
         ),
         (
             [
@@ -112,7 +112,7 @@ def test_a_label_of_no_class_is_refused_wherever_it_is_read(label: float, worker
                 "data.kind=angles",
                 "uncertainty=[ensemble,conformal,temperature]",
             ],
-            "No temperature is known",
+            "cannot be changed",
         ),
         (
             ["density_head=von_mises", "+metric.two.name=listed"],

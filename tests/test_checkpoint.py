@@ -109,7 +109,7 @@ def test_every_cut_is_refused(saved: Path, tmp_path: Path) -> None:
         ):
             read(saved)
     saved.write_bytes(whole + b"\0")
-    with pytest.raises(CheckpointError, match="cut short, or it is no checkpoint"):
+    with pytest.raises(CheckpointError, match="cut short, or it is not a checkpoint"):
         read(saved)
 
 
@@ -148,7 +148,7 @@ def test_code_in_a_checkpoint_is_refused_unrun(saved: Path, tmp_path: Path) -> N
             return os.mkdir, (str(tmp_path / "was run"),)
 
     torch.save({"state_dict": Danger()}, saved)
-    with pytest.raises(CheckpointError, match="no checkpoint of this framework"):
+    with pytest.raises(CheckpointError, match="not a checkpoint of this framework"):
         read(saved)
     # A forger can write the checksum too.
     forged = saved.read_bytes()
@@ -357,7 +357,7 @@ STRUCTURED: dict[str, Callable[[], Any]] = {
     "a path": lambda: Path("a"),
     "bytes": lambda: bytearray(b"a"),
 }
-"""Objects that torch stores and that are no dense arrays of plain numbers, stored number by number."""
+"""Objects that torch stores and that are not dense arrays of plain numbers, stored number by number."""
 
 
 @pytest.mark.filterwarnings("ignore")  # of torch, about kinds of tensors that are beta or deprecated

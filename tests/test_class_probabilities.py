@@ -132,7 +132,7 @@ def test_few_draws_leave_probabilities_that_sum_to_one(chain, dtype):
         config = {"name": name, **GENERIC[name], "component": config}
     head = build("density_head", resolve("density_head", config), target=Target("class", ("a", "b", "c")))
     torch.manual_seed(0)
-    # far from what is drawn every class may be so unlikely that its probability is no float64
+    # far from what is drawn every class may be so unlikely that its probability is not float64
     raw = 3 * torch.randn(20, head.size, dtype=dtype)
     with torch.no_grad():
         found = class_probabilities(head.to(dtype)(raw))

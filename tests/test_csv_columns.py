@@ -44,7 +44,7 @@ def test_an_empty_cell_in_a_table_of_one_column_is_a_row(tmp_path: Path) -> None
         ("a b\n1 2\n3 4", r"is separated by blanks: its first line is 'a b'. Commas"),
         ("1,2\n3,4", r"line 1: '1, 2' are numbers, but the first line must name the columns"),
         ("a,b,a\n1,2,3", "the column 'a' is named twice"),
-        (",a\nx,1", r"column 1 has no name, but holds 'x', which is no row number"),
+        (",a\nx,1", r"column 1 has no name, but holds 'x', which is not a row number"),
         (
             "a,b\n1,5,2\n",
             r"line 2: the line has 3 cells, but the first line names 2 .* with a decimal comma in quotation marks",
@@ -70,14 +70,17 @@ def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("cell", "message"),
     [
-        ("abc", r"line 4, column 'a': 'abc' is no finite number"),
-        ("", r"line 4, column 'a': '' is no finite number.* Or set it to skip\."),
-        ("NA", r"'NA' is no finite number.* Or set it to skip\."),
-        ("nan", r"'nan' is no finite number.* Or set it to skip\."),
-        ("-inf", r"'-inf' is no finite number, which is required\. Correct the cell, or remove the line\.$"),
-        ("1e999", "'1e999' is no finite number"),
-        ("1_0", "'1_0' is no finite number"),
-        ('"1,5"', r"'1,5' is no finite number.* The cell is a number with a decimal comma\. Write 1\.5"),
+        ("abc", r"line 4, column 'a': 'abc' is not a finite number"),
+        ("", r"line 4, column 'a': '' is not a finite number.* Or set it to skip\."),
+        ("NA", r"'NA' is not a finite number.* Or set it to skip\."),
+        ("nan", r"'nan' is not a finite number.* Or set it to skip\."),
+        (
+            "-inf",
+            r"'-inf' is not a finite number, which is required\. Correct the cell, or remove the line\.$",
+        ),
+        ("1e999", "'1e999' is not a finite number"),
+        ("1_0", "'1_0' is not a finite number"),
+        ('"1,5"', r"'1,5' is not a finite number.* The cell is a number with a decimal comma\. Write 1\.5"),
     ],
 )
 def test_cells_that_are_no_finite_number_are_named(tmp_path: Path, cell: str, message: str) -> None:

@@ -143,7 +143,7 @@ class Needles(Data):
             assert self.input_shape == (2,)
         if self.fault == "read sorts":
             files = sorted(files)
-        if not files and self.fault != "no file is no sample":
+        if not files and self.fault != "no file is not a sample":
             raise DataError("no file was given; wanted one for each needle.")
         points = torch.tensor([self.line(Path(file), 2) for file in files]).reshape(-1, 2)
         if self.fault == "the scaling stays behind" and hasattr(self, "tables"):
@@ -261,7 +261,7 @@ FAULTS = {
     "read wants prepare": "own files",
     "read sorts": "own files",
     "read doubles": "own files",
-    "no file is no sample": "own files",
+    "no file is not a sample": "own files",
     "read guesses the target": "own files",
     "bad own files are zeros": "damaged own files are named",
     "the scaling stays behind": "raw input",

@@ -39,22 +39,22 @@ from framework.testing.rows import HeadRow
 from tests.conftest import Framework
 
 FITTED = ("ballistic", "extra_trees", "fit_pose", "lorentzian", "xgboost")
-"""Heads that are fitted in one step; they are no networks."""
+"""Heads that are fitted in one step; they are not networks."""
 REFUSED_HEADS = {
     "quantiles": "A PiecewiseQuantiles cannot be exported",
     "lorentzian": "fitted in one step",
 }
-"""Heads whose densities have no NumPy code, and one that is no network, with words of the refusal."""
+"""Heads whose densities have no NumPy code, and one that is not a network, with words of the refusal."""
 HEADS = [name for name in installed("density_head") if name not in {*FITTED, *REFUSED_HEADS}]
 
 
 REFUSED_ENCODERS = {
     "points": "random choice of points|order of the farthest points",
     "pointnet2": "order of the farthest points",
-    "projection": "Its part Projection is no sequence of operations",
-    "rasterised": "Its part Rasterised is no sequence of operations|does not accept the random inputs",
-    "ballistic": "Its part BallisticEncoder is no sequence of operations|does not accept the random inputs",
-    "extrapolation": "Its part ExtrapolationEncoder is no sequence of operations|does not accept the random inputs",
+    "projection": "Its part Projection is not a sequence of operations",
+    "rasterised": "Its part Rasterised is not a sequence of operations|does not accept the random inputs",
+    "ballistic": "Its part BallisticEncoder is not a sequence of operations|does not accept the random inputs",
+    "extrapolation": "Its part ExtrapolationEncoder is not a sequence of operations|does not accept the random inputs",
     "unet: odd size": "A crop depends on the pixels",
     "unet: over its input": "A crop depends on the pixels",
     "slim: odd size": "A crop depends on the pixels",
@@ -369,7 +369,7 @@ def test_predictions_do_not_depend_on_the_other_inputs_of_a_batch(
         ([np.array([[0, 0, 0], [0, np.inf, 0]])], "Point 1 of cloud 0 is not finite"),
         ([[[1, 2]]], "reads inputs of shape"),
         ([[1, 2, 3]], "Clouds must be arrays"),
-        ([[["x", 2, 3]]], "no array of numbers"),
+        ([[["x", 2, 3]]], "not an array of numbers"),
     ):
         with pytest.raises(ValueError, match=words):
             model(bad)

@@ -73,7 +73,9 @@ def test_two_at_once_write_it_once(cache: Path) -> None:
 def test_a_changed_mark_is_refused(cache: Path) -> None:
     root = generated.ensure_generated(cache / "things" / "c", {"seed": 1}, write)
     (root / MARK).write_text(json.dumps({"seed": 2}), encoding="utf-8")
-    with pytest.raises(DataError, match=r"does not describe \{'seed': 1\}, so it was changed\. Delete"):
+    with pytest.raises(
+        DataError, match=r"does not describe \{'seed': 1\}, so this file was changed\. Delete"
+    ):
         generated.ensure_generated(cache / "things" / "c", {"seed": 1}, write)
     (root / MARK).write_text("{", encoding="utf-8")
     with pytest.raises(DataError, match=r"synthetic\.json: cannot be read .* Delete"):

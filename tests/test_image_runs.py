@@ -95,7 +95,7 @@ def test_a_killed_run_goes_on_bit_by_bit(
         for done in (whole, killed)
     ]
     assert all(torch.equal(models[1][name], tensor) for name, tensor in models[0].items())
-    assert not any("discriminator" in name for name in models[0]), "a rival is no part of the model"
+    assert not any("discriminator" in name for name in models[0]), "a rival is not part of the model"
 
 
 def people(folder: Path) -> tuple[str, ...]:

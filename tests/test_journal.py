@@ -63,7 +63,7 @@ def test_any_name_and_any_float_survive_as_valid_json(
     journal.close()
 
     def no_constants(name: str) -> float:
-        raise AssertionError(f"{name} is no JSON")
+        raise AssertionError(f"{name} is not JSON")
 
     for line in path.read_bytes().splitlines() if path.exists() else []:
         json.loads(line, parse_constant=no_constants)

@@ -133,7 +133,7 @@ mode=combine | mode.members is missing
 mode=combine mode.members=nowhere | at least two are required
 mode=combine mode.members=nowhere uncertainty=[ensemble] | uncertainty=ensemble needs several models
 mode=encode mode.files=a mode.into=b | data.name is missing
-mode=sync mode.run=nowhere | is no run folder
+mode=sync mode.run=nowhere | is not a run folder
 mode=check | needs a plugin, but none is chosen
 --epochs 5 | without dashes: trainer.max_epochs=5
 --epochs=5 | without dashes: trainer.max_epochs=5
@@ -242,7 +242,7 @@ def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
         assert said.startswith("error: ")
         assert said.endswith("\n")
         assert said.count("\n") == 1, said
-        assert not [*(tmp_path / "here").rglob("*.*")], "a mistake is no run"
+        assert not [*(tmp_path / "here").rglob("*.*")], "a mistake is not a run"
         return said
 
     return say

@@ -22,7 +22,7 @@ from framework.tracking.journal import _record
 from framework.tracking.run_info import SIDECAR, RunInfo, read_run_info
 
 NO_NUMBERS = [True, "1_0", "nan", "0x10", " 1 ", "1", None, [], {}]
-"""Values that are no numbers, although Python or NumPy converts most of them to one."""
+"""Values that are not numbers, although Python or NumPy converts most of them to one."""
 CAMERA = {"K": [[10.0, 0, 5], [0, 10, 5], [0, 0, 1]], "R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "t": [0, 0, 2]}
 
 

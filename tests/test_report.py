@@ -169,7 +169,7 @@ def test_the_command_reports_on_a_run(framework: Framework, tmp_path: Path) -> N
     assert "log-likelihood" in text and "hydra-core" in text
     assert "All data of this report are synthetic" in text
     done = framework("mode=report", "mode.run=nowhere", folder=None)
-    assert done.code == 2 and "mode.run=nowhere is no folder" in done.out
+    assert done.code == 2 and "mode.run=nowhere is not a folder" in done.out
 
 
 @pytest.mark.slow

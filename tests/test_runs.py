@@ -473,7 +473,7 @@ def test_a_wrong_key_or_value_is_said_before_any_data_is_read(
     assert done.code == 2, done.out
     assert message in done.out
     assert "Traceback" not in done.out
-    assert not done.folder.exists(), "a mistake is no run"
+    assert not done.folder.exists(), "a mistake is not a run"
 
 
 def test_a_run_is_named_by_what_tells_it_from_its_neighbours() -> None:

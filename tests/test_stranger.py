@@ -46,7 +46,7 @@ def test_a_broken_package_breaks_only_itself(framework: Framework, broken_site: 
 @pytest.fixture
 def clashing_site(tmp_path: Path) -> Path:
     """Packages that nobody asked for: one gives a name that is ours to its head, two ship one config, and one has a
-    source in latin-1 and a config that is no YAML."""
+    source in latin-1 and a config that is not YAML."""
     site = tmp_path / "clashing_site"
     heads = {"twin": "gaussian", "second": "second", "latin": "latin"}
     for package, head in heads.items():

@@ -365,7 +365,7 @@ def test_empty_batches():
 
 
 def test_what_has_no_power_and_bad_temperatures_get_a_sentence():
-    with pytest.raises(UserError, match=r"No temperature is known for Cardioid over \(3,\) numbers"):
+    with pytest.raises(UserError, match=r"The temperature of Cardioid over \(3,\) numbers cannot be changed"):
         temper(Cardioid(torch.zeros(2, 3)), hot(2.0))
     for bad in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(ValueError, match="expected a finite number above 0"):

@@ -65,7 +65,7 @@ def read(file: Path) -> Motion:
     """Read a BVH file, angles in degrees, y up.
 
     Raises:
-        DataError: the file cannot be read, or is no BVH file.
+        DataError: the file cannot be read, or is not a BVH file.
     """
     with translate_errors(
         file, "a motion in BVH format", missing="expected a motion in BVH format. Correct the path."

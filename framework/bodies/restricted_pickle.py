@@ -148,7 +148,7 @@ def _obey(name: str, argument: Any, stack: list[Any]) -> None:
         case "APPEND" | "APPENDS":
             items = [stack.pop()] if name == "APPEND" else _since_mark(stack)
             if type(stack[-1]) is not list:
-                _refuse("the pickle appends to an object that is no list")
+                _refuse("the pickle appends to an object that is not a list")
             stack[-1].extend(items)
         case "SETITEM" | "SETITEMS":
             items = [stack.pop(), stack.pop()][::-1] if name == "SETITEM" else _since_mark(stack)
@@ -170,7 +170,7 @@ def _obey(name: str, argument: Any, stack: list[Any]) -> None:
         case "BUILD":
             state = stack.pop()
             if not isinstance(stack[-1], _Record) or not stack[-1].called:
-                _refuse("the pickle sets attributes of something that is no object")
+                _refuse("the pickle sets attributes of something that is not an object")
             stack[-1].state = state
         case _:
             _refuse(f"the pickle has the instruction {name}, which arrays do not need")
@@ -187,7 +187,7 @@ def _since_mark(stack: list[Any]) -> list[Any]:
 
 def _set(target: Any, items: list[Any]) -> None:
     if type(target) is not dict:
-        _refuse("the pickle sets an item of an object that is no dictionary")
+        _refuse("the pickle sets an item of an object that is not a dictionary")
     for key, value in zip(items[::2], items[1::2], strict=True):
         if not (isinstance(key, str | bytes) or (isinstance(key, int) and abs(key) < 2**31)):
             _refuse(

@@ -220,7 +220,7 @@ def _describe_unreadable(override: str) -> str:
 
 
 def _describe_damage(error: BaseException) -> str | None:
-    """Return the message for an error caused by a file that is no valid config; None for any other error."""
+    """Return the message for an error caused by a file that is not a valid config; None for any other error."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, yaml.YAMLError):
         cause = cause.__cause__

@@ -138,7 +138,7 @@ def stored_shape(stored: Sequence[Any]) -> tuple[int, ...]:
     """Return the stored shape of an input.
 
     Raises:
-        ValueError: The value is no shape, or has more than MOST_SIDES dimensions or MOST_INPUT elements.
+        ValueError: The value is not a shape, or has more than MOST_SIDES dimensions or MOST_INPUT elements.
     """
     shape = tuple(map(int, stored[: MOST_SIDES + 1]))
     if len(shape) > MOST_SIDES or min(shape, default=0) < 0 or math.prod(shape) > MOST_INPUT:

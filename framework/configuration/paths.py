@@ -90,7 +90,7 @@ def remove_paths(
         not listed.
 
     Raises:
-        ConfigError: The config has no part for a key of `user_values`, or the key is no path of the model.
+        ConfigError: The config has no part for a key of `user_values`, or the key is not a path of the model.
     """
     cleaned = deepcopy(dict(config))
     dropped: dict[str, Any] = {}
@@ -307,7 +307,7 @@ def _is_marked_path(annotation: Any) -> bool:
 
 
 def _path_mark(annotation: Any) -> bool | None:
-    """Return True if an annotation says that a text is a path, False if it says that it is none, and None otherwise."""
+    """Return whether a text is a path according to its annotation; None if the annotation says nothing about it."""
     marks = [item.path for item in getattr(annotation, "__metadata__", ()) if isinstance(item, Mark)]
     if isinstance(annotation, type) and issubclass(annotation, PurePath):
         marks.append(True)

@@ -98,8 +98,7 @@ def load(group: str, name: str) -> type[Any]:
     """Import and return the class called `name`; plugins are imported here and nowhere else.
 
     Raises:
-        ConfigError: There is no such name, the import fails, or the class is no complete implementation of the group's
-            base.
+        ConfigError: There is no such name, the import fails, or the class does not implement all of the group's base.
     """
     entry = find(group, name)
     # the contract is imported before its plugin, because framework.metric imports torchmetrics in its own way
@@ -193,7 +192,7 @@ def config_folders() -> dict[str, Path]:
 
 def package_folders(package: str) -> list[Path]:
     """Return the folders of a top-level package without importing it; an empty list if it is not found."""
-    with suppress(ImportError, ValueError):  # the name is no module name, or the module has no spec
+    with suppress(ImportError, ValueError):  # the name is not a module name, or the module has no spec
         spec = find_spec(package)
         return [Path(root) for root in (spec.submodule_search_locations if spec else None) or ()]
     return []

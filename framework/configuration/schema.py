@@ -322,7 +322,7 @@ def _models(cls: type) -> dict[str, type[BaseModel]]:
     """Return for each key a pydantic model with one field `value`, whose alias is the key.
 
     Raises:
-        ConfigError: An annotation is no type that pydantic can check.
+        ConfigError: An annotation is not a type that pydantic can check.
     """
     models = {}
     config = ConfigDict(extra="forbid", arbitrary_types_allowed=True)

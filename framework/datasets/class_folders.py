@@ -117,7 +117,7 @@ def collect(
     files, labels, splits, ignored = [], [], [], 0
     for name, split, folder in folders_of_class:
         visible = (path for path in folder.iterdir() if not path.name.startswith("."))
-        # a folder with such a suffix is listed too; the message about reading it says that it is no file
+        # a folder with such a suffix is listed too; the message about reading it says that it is not a file
         entries = sorted(path for path in visible if path.is_file() or path.suffix.lower() in suffixes)
         matching = [path for path in entries if path.suffix.lower() in suffixes]
         ignored += len(entries) - len(matching)
@@ -133,5 +133,5 @@ def collect(
 def subfolders(root: Path, remedy: str) -> list[Path]:
     """Return the folders in `root`, sorted, without those whose names begin with a dot or an underscore."""
     if not root.is_dir():
-        raise DataError(f"data.root = {root} does not exist or is no folder. {remedy}")
+        raise DataError(f"data.root = {root} does not exist or is not a folder. {remedy}")
     return sorted(path for path in root.iterdir() if path.is_dir() and path.name[0] not in "._")

@@ -355,7 +355,7 @@ def _select_named(
             continue
         if any(cells) and not _is_distinct_whole(cells):
             raise DataError(
-                f"{file}: column {position} has no name, but holds {quote(next(filter(None, cells)))}, which is no "
+                f"{file}: column {position} has no name, but holds {quote(next(filter(None, cells)))}, which is not a "
                 "row number. Name the column in the first line, or remove it."
             )
         left_out[f"column {position}, without a name"] = "row numbers" if any(cells) else "empty"
@@ -372,7 +372,7 @@ def require(columns: Columns, names: Sequence[str], setting: str) -> None:
         setting: the setting that names them, for example "data.columns".
 
     Raises:
-        DataError: a name is no column; the message suggests the most similar column name.
+        DataError: a name is not a column; the message suggests the most similar column name.
     """
     for name in names:
         if name not in columns.cells:
@@ -503,7 +503,7 @@ def _other_reading(cell: str, writing: Writing) -> text.Suggestion | None:
         grouped = writing.sign == "," and re.fullmatch(GROUPED_BY_POINTS, digits)
         settings = ({"thousands": "point"},) if grouped else ()
         number = cell.replace(".", "") if grouped else f"{cell} in the notation of the other columns"
-        return text.Suggestion("with a point, which is no decimal sign in this table", number, settings)
+        return text.Suggestion("with a point, which is not a decimal sign in this table", number, settings)
     return text.suggest_number(cell)
 
 
@@ -576,7 +576,7 @@ def numbers(
         value = BOOLEANS.get(cell.lower(), math.nan) if booleans else number(cell, notation)
         if value is None or math.isinf(value) or (missing is not None and math.isnan(value)):
             raise DataError(
-                f"{columns.file} line {columns.lines[row]}, column {quote(name)}: {quote(cell)} is no finite "
+                f"{columns.file} line {columns.lines[row]}, column {quote(name)}: {quote(cell)} is not a finite "
                 "number, which is required. Correct the cell, or remove the "
                 f"line.{_hint(cell, value, columns, missing)}"
             )
@@ -612,7 +612,7 @@ def _check_units(columns: Columns, name: str) -> None:
 
 
 def _all_finite(cells: Sequence[str], writing: Writing = PLAIN) -> Float[np.ndarray, "rows"] | None:
-    """Return the same numbers as `number` for all cells, several times as fast; None if a cell is no finite number."""
+    """Return the numbers that `number` returns for all cells, several times as fast; None if one is not finite."""
     joined = "".join(cells)
     if "_" in joined:
         return None

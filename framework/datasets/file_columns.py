@@ -58,7 +58,7 @@ def list_files(table: Columns) -> Iterator[tuple[str, Split | None]]:
         word = table.cells[SPLIT][index] if SPLIT in table.cells else None
         if word is not None and word not in SPLITS:
             raise DataError(
-                f"{table.file} line {number}, column `{SPLIT}`: {quote(word)} is no split. Write one of "
+                f"{table.file} line {number}, column `{SPLIT}`: {quote(word)} is not a split. Write one of "
                 f"{', '.join(SPLITS)}.{did_you_mean(word, SPLITS)}"
             )
         yield name, cast(Split | None, word)

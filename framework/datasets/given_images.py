@@ -39,7 +39,7 @@ def to_inputs(data: Data, images: Any) -> Tensor:
         )
         if pixels.dtype != np.uint8 or pixels.ndim < 3 or pixels.shape[3:] not in allowed:
             raise DataError(
-                f"Got an array of shape {'×'.join(map(str, images.shape))} and type {images.dtype}, which is no "
+                f"Got an array of shape {'×'.join(map(str, images.shape))} and type {images.dtype}, which is not an "
                 f"image. Expected uint8 of shape (height, width, 3), or shape {'×'.join(map(str, data.input_shape))} "
                 "with uint8 or values from 0 to 1."
             )

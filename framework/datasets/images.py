@@ -73,7 +73,7 @@ class Crop:
         """Read the file and return the square.
 
         Raises:
-            DataError: the file is missing, is no image or is truncated, or the box lies outside the image.
+            DataError: the file is missing, is not an image or is truncated, or the box lies outside the image.
         """
         with open_image(self.file) as raw, DECODED.reserve(raw.width * raw.height):
             image = decode(raw, self.channels, upright=self.upright)
@@ -87,7 +87,7 @@ class Crop:
         """Check the file's header and the box; pixels are not decoded.
 
         Raises:
-            DataError: the file is missing, is no image, or the box lies outside the image.
+            DataError: the file is missing, is not an image, or the box lies outside the image.
         """
         with open_image(self.file) as image:
             if self.box is not None and clip_box(self.box, image.size) is None:
@@ -105,7 +105,7 @@ def open_image(file: Path) -> Iterator[Image.Image]:
     """Open an image file inside a `with` block.
 
     Raises:
-        DataError: the file is missing, is no image, or is truncated; the message names it.
+        DataError: the file is missing, is not an image, or is truncated; the message names it.
     """
     with (
         reading.translate_errors(
@@ -125,7 +125,7 @@ def open_stream(stream: BinaryIO | BytesIO) -> Iterator[Image.Image]:
 
     Raises:
         ValueError: the image has more pixels than `MOST_PIXELS_OF` and `LONGEST_SIDE` allow.
-        Exception: the content is no image, or damaged.
+        Exception: the content is not an image, or damaged.
     """
     try:
         opened = Image.open(stream, formats=FORMATS)

@@ -245,7 +245,7 @@ def _camera(name: str, view: Mapping[str, Any]) -> Camera:
     deviation = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if not deviation < SLACK or np.linalg.det(rotation) < 0:
         raise ValueError(
-            f"view {name}: R is no rotation (RRᵀ differs by {deviation:.2g} from the identity, the determinant is "
+            f"view {name}: R is not a rotation (RRᵀ differs by {deviation:.2g} from the identity, the determinant is "
             f"{np.linalg.det(rotation):.3g}); expected the rotation from the world to the camera: x right, y down, z "
             "forward"
         )
@@ -275,7 +275,7 @@ def _checked_view(folder: Path, name: str, camera: Camera) -> View:
         with images.open_image(file) as image:
             _check_size(file, image, camera)
             if tail(file)[-8:] != PNG_END:
-                raise ValueError("the file is cut off, or is no PNG file")
+                raise ValueError("the file is cut off, or is not a PNG file")
     return view
 
 

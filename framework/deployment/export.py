@@ -194,7 +194,7 @@ def export(predictor: Predictor, description: Description, into: Path) -> Mappin
     bare = _without_hooks(predictor)
     model = Exporting(bare, description, reader(description).preprocessing())
     if any(isinstance(part, Fitted) for part in bare.modules()):
-        raise _refusal(model, "Its density head is fitted in one step and is no network.")
+        raise _refusal(model, "Its density head is fitted in one step and is not a network.")
     try:
         with (
             torch.no_grad()
@@ -416,9 +416,7 @@ def _reason(error: BaseException) -> str:
     name = type(own[-1]).__name__ if own and not isinstance(own[-1], Traced) else "density"
     lines = [line.strip() for line in str(error).replace("\x1b[96m", "").replace("\x1b[0m", "").splitlines()]
     cause = next((line for line in lines if line), type(error).__name__)
-    return (
-        f"Its part {name} is no sequence of operations that torch.export can follow ({shorten(cause, 120)})."
-    )
+    return f"Its part {name} is not a sequence of operations that torch.export can follow ({shorten(cause, 120)})."
 
 
 @torch.no_grad()

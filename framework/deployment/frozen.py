@@ -98,15 +98,15 @@ class Frozen:
         """Return the prediction for inputs.
 
         For class targets, this is the probability of each class, (batch, class). For image targets, it is the mean,
-        (batch, height, width, number), because the median of a mixture of images is no plausible image. Otherwise, it
-        is the point prediction, (batch, number).
+        (batch, height, width, number), because the median of a mixture of images is not a plausible image. Otherwise,
+        it is the point prediction, (batch, number).
 
         Args:
             inputs: inputs that the model of `framework.load` accepts. After `freeze_predictor`, the inputs of the
                 predictor, batch dimension first, as NumPy array or torch tensor on the CPU.
 
         Raises:
-            DataError: `inputs` is no input of this model.
+            DataError: `inputs` is not an input of this model.
             ValueError: a raw parameter is not finite; the message names the first row of the batch with such a
                 parameter.
         """

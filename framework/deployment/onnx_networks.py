@@ -124,7 +124,7 @@ def _trains(predictor: Predictor, probe: Tensor) -> bool:
     try:
         with torch.random.fork_rng([]):
             predictor(probe)
-    except Exception:  # random numbers are no inputs of this model
+    except Exception:  # random numbers are not inputs of this model
         return True
     finally:
         for hook in hooks:

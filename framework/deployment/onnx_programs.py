@@ -62,7 +62,7 @@ class Session:
     """A session of ONNX Runtime that can be copied and pickled.
 
     Attributes:
-        run: its method `run`.
+        run: method `run` of ONNX Runtime's session.
     """
 
     def __init__(self, model: Path | bytes, threads: int = 1) -> None:

@@ -32,7 +32,7 @@ def class_probabilities(density: Distribution) -> Float64[Tensor, "batch class"]
     if not density.has_enumerate_support or tuple(density.event_shape):
         raise UserError(
             f"A metric reads class probabilities, but the model predicts a {type(density).__name__} with event_shape "
-            f"{tuple(density.event_shape)}, which is no density over classes. Choose a density head that predicts "
+            f"{tuple(density.event_shape)}, which is not a density over classes. Choose a density head that predicts "
             "classes, such as density_head=categorical, or leave the metric out."
         )
     estimates = estimate(density, density.enumerate_support())
@@ -58,7 +58,7 @@ def require_labels(target: Real[Tensor, "batch"], classes: int) -> Real[Tensor, 
     wrong = ~((target >= 0) & (target < classes))
     if wrong.any():
         raise DataError(
-            f"{int(wrong.sum())} of {len(target)} targets of this batch are no class index: the target in row "
+            f"{int(wrong.sum())} of {len(target)} targets of this batch are not a class index: the target in row "
             f"{int(wrong.nonzero()[0])} is {target[wrong][0].item():g}, but class indices go from 0 to {classes - 1}. "
             "Correct the labels of the data."
         )

@@ -393,7 +393,7 @@ def _(density: Mixture, index: Tensor) -> Distribution:
 def _(density: Reshaped, index: Tensor) -> Distribution:
     """Return the density at `index`; where possible, no samples are drawn from items that are not chosen.
 
-    This is possible if the wrapped density has one batch dimension and is no mixture.
+    This is possible if the wrapped density has one batch dimension and is not a mixture.
     """
     inner = density.density
     # a picked mixture draws from all its items for each pick; here these would be the items of the whole batch

@@ -44,7 +44,7 @@ def _parameters(density: Distribution, inner: bool = True) -> list[str]:
 
 
 def _parameter(key: str, value: object, inner: bool) -> str:
-    """Return an attribute of a density as a short text; '' if it is not printed because it is no parameter.
+    """Return an attribute of a density as a short text; '' if it is not printed because it is not a parameter.
 
     Args:
         key: name of the attribute.

@@ -107,7 +107,7 @@ def exported(density: Distribution) -> Exported:
         ConfigError: the density has not registered a function, for example because it draws random numbers.
     """
     raise ConfigError(
-        f"A {type(density).__name__} cannot be exported, because its values are no function of a few tensors that "
+        f"A {type(density).__name__} cannot be exported, because its values are not a function of a few tensors that "
         "NumPy could read: it draws random numbers, or nobody has registered one with "
         "`framework.distributions.exported.exported.register`. Use framework.load or framework.freeze for this model."
     )

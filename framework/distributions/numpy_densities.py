@@ -82,7 +82,7 @@ class Density:
         """Probability of each class, (*batch, class).
 
         Raises:
-            ValueError: the target is no class.
+            ValueError: the target is not a class.
         """
         raise ValueError("Only classes have probabilities. Use `log_prob`.")
 

@@ -84,8 +84,8 @@ def _(density: Distribution, temperature: Tensor) -> Distribution:
     if isinstance(support, Circular) and support.ranges is None:
         return CircularPower(density, temperature)
     raise UserError(
-        f"No temperature is known for {type(density).__name__} over {tuple(density.event_shape)} numbers: p^(1/T) "
-        "has no normaliser in closed form that the framework knows. Register this power with "
+        f"The temperature of {type(density).__name__} over {tuple(density.event_shape)} numbers cannot be changed, "
+        "because the framework does not know how to normalise the power p^(1/T). Register this power with "
         "`framework.distributions.protocol.tempered_density.register`, or leave out the wrapper that changes the "
         "temperature."
     )

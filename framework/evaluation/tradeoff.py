@@ -69,7 +69,7 @@ class Curve:
 
 
 def knob_owners(predictor: Predictor, knob: str) -> list[Uncertainty | DensityHead]:
-    """Return the uncertainty wrappers with the knob or, if there are none, the heads with it; [] for `knob=""`.
+    """Return the wrappers with the knob or, if no wrapper has it, the heads with the knob; [] for `knob=""`.
 
     Raises:
         ConfigError: no wrapper or head has the knob; the message lists the existing knobs.

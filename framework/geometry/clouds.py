@@ -66,7 +66,7 @@ def sizes(clouds: Tensor) -> Int[Tensor, "batch"]:
     """Return the number of points of each cloud of a batch (batch, points, columns), without the padding.
 
     Raises:
-        DataError: the tensor is no batch of clouds, a cloud has no points, or a number of a point is NaN or infinite.
+        DataError: the tensor is not a batch of clouds, a cloud has no points, or a number of a point is not finite.
             The message names the cloud, and its first bad point.
     """
     if clouds.dim() != 3 or clouds.shape[2] < 3 or clouds.dtype not in (torch.float32, torch.float64):
@@ -208,7 +208,7 @@ def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> NormalisedC
     # relative to the first point: clouds far from the origin keep their digits, and equal points are exactly equal
     offset = coordinates - first
     if real is not None:
-        offset = offset.where(real, 0)  # before anything is multiplied: NaN × 0 is no gradient
+        offset = offset.where(real, 0)  # before anything is multiplied: NaN × 0 is not a gradient
     counted_points = real if how == "unit_ball" else near_middle(offset, real)
     if counted_points is None:
         mean = offset.mean(1, keepdim=True)

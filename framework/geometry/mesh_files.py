@@ -118,7 +118,7 @@ def numbers(lines: Sequence[bytes], dtype: type = np.float64, place: Place | Non
     """Return all numbers in `lines`, concatenated.
 
     Raises:
-        ValueError: a word is no number; the message names the line if `place` is given.
+        ValueError: a word is not a number; the message names the line if `place` is given.
     """
     joined = b" ".join(lines).strip()  # NumPy reads blanks alone as a number
     try:
@@ -167,7 +167,7 @@ def rows(
         place: function from the index of a line to its number in the file.
 
     Raises:
-        ValueError: a line has more or fewer numbers, or a word that is no number; the message names the line.
+        ValueError: a line has more or fewer numbers, or a word that is not a number; the message names the line.
     """
     columns = len(lines[0].split()) if width is None and lines else width or 0
     values = numbers(lines, place=place)
@@ -346,7 +346,7 @@ def stl(content: bytes) -> Parsed:
     else:
         rest = len(content) - announced_bytes
         fault = (
-            "the file is cut short, or is no STL file"
+            "the file is cut short, or is not an STL file"
             if announced_faces < 0 or rest < 0
             else f"{rest} unexpected bytes follow the faces"
         )

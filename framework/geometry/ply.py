@@ -78,7 +78,7 @@ def ply(content: bytes) -> Parsed:
     Unsigned integer colours are divided by the largest number of their type, to 0…1.
 
     Raises:
-        ValueError: the file is no PLY, has an unknown type, fewer or more data than the header announces, or faces as
+        ValueError: the file is not PLY, has an unknown type, fewer or more data than the header announces, or faces as
             strips of triangles.
     """
     content = text.remove_byte_order_mark(content)
@@ -92,7 +92,9 @@ def ply(content: bytes) -> Parsed:
     order, elements = _header(content[: end.start()])
     names = {element.name for element in elements}
     if "tristrips" in names:
-        raise ValueError("the faces are strips of triangles; save the mesh with single faces")
+        raise ValueError(
+            "the faces are strips of triangles, which are not supported; save separate triangles"
+        )
     if "vertex" not in names:
         raise ValueError(
             f"the header lists the elements {shorten(', '.join(sorted(names))) or 'none'}; expected an element named "

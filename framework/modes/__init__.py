@@ -38,7 +38,7 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
     name = values["mode"].get("name") if isinstance(values.get("mode"), dict) else None
     if not isinstance(name, str) or name not in MODES:
         raise ConfigError(
-            f"mode = {name!r} is no mode.{did_you_mean(str(name), MODES)} The modes are {', '.join(MODES)}."
+            f"mode = {name!r} is not a mode.{did_you_mean(str(name), MODES)} The modes are {', '.join(MODES)}."
         )
     config = Config.of(values, folder, overrides)
     # A resumed run keeps its settings, which an earlier version may have accepted without this check.

@@ -298,7 +298,7 @@ def collect_files(root: Path) -> list[Path]:
     )
     if not names:
         raise DataError(
-            f"mode.files={root} is no folder with files. Set mode.files to the folder whose files are to be encoded."
+            f"mode.files={root} is not a folder with files. Set mode.files to the folder whose files are to be encoded."
         )
     return [root / name for name in names]
 

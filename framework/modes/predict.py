@@ -160,7 +160,7 @@ def predictions(
     A row has the name of a sample, the point prediction, the density's entropy in nats and the prediction set, or, if
     the model predicts no sets, the interval of probability `mass`. Standard errors are included if the ends of
     intervals are estimated from random values. If the data set draws maps of `files`, the tensors are, for each
-    batch, the point predictions and the standard deviations, each (batch, number); otherwise there are none.
+    batch, the point predictions and the standard deviations, each (batch, number); otherwise there are no tensors.
 
     Predicted images are written to the folder `images`, and the row contains the name of the image file. `examine` is
     called with the first batch.

@@ -21,12 +21,14 @@ def run(config: Config) -> None:
     """Write the report, and print its files.
 
     Raises:
-        ConfigError: `mode.run` is no folder, or holds no results.
+        ConfigError: `mode.run` is not a folder, or holds no results.
     """
     options = config.options(ReportOptions)
     folder = Path(options.run).expanduser()
     if not folder.is_dir():
-        raise ConfigError(f"mode.run={folder} is no folder. Set mode.run to the folder of a run or a sweep.")
+        raise ConfigError(
+            f"mode.run={folder} is not a folder. Set mode.run to the folder of a run or a sweep."
+        )
     files = write_report(folder, Path(options.into).expanduser() if options.into else folder)
     with suppress(OSError):  # an empty run folder of this command
         config.folder.rmdir()

@@ -28,7 +28,7 @@ def run(config: Config) -> None:
     runs = [run for run in (folder, *jobs) if (run / "run.json").is_file()]
     if not runs:
         raise ConfigError(
-            f"mode.run={folder} is no run folder, because {folder / 'run.json'} does not exist. Set mode.run to the "
+            f"mode.run={folder} is not a run folder, because {folder / 'run.json'} does not exist. Set mode.run to the "
             "folder of a run or of a sweep."
         )
     errors: list[UserError] = []

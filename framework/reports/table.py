@@ -308,7 +308,7 @@ def _spread(row: Row, key: str) -> float | None:
 
 
 def _number(value: object) -> float | None:
-    """Return a value as float; None if it is no number, NaN or a truth value."""
+    """Return a value as float; None if it is not a number, NaN or a truth value."""
     if isinstance(value, bool | np.bool_ | str) or not isinstance(value, SupportsFloat):
         return None
     number = float(value)

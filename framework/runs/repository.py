@@ -85,7 +85,7 @@ def git_commit(folder: Path) -> dict[str, str]:
 
 
 def _repository(folder: Path) -> Repository | None:
-    """Return the nearest repository that contains a folder, or None; like git, skip a `.git` that is no repository."""
+    """Return the nearest repository that contains a folder, or None; like git, skip a `.git` without a repository."""
     ceilings = {
         os.path.realpath(ceiling)
         for ceiling in os.environ.get("GIT_CEILING_DIRECTORIES", "").split(":")

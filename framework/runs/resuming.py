@@ -77,8 +77,8 @@ def read_command(
     changing = [item for item, key in keys.items() if key not in allowed and not key.startswith("stored.")]
     if changing:
         raise ConfigError(
-            f"resume={folder} continues with the config of that run, which {' '.join(changing)} would change. "
-            f"Leave these overrides out, or start a new run. Only {', '.join(CHANGEABLE)} may be overridden."
+            f"resume={folder} continues that run with its own config, but {' '.join(changing)} would change this "
+            f"config. Leave these overrides out, or start a new run. Only {', '.join(CHANGEABLE)} may be overridden."
         )
     earlier = read_run_info(folder)
     if earlier is not None and earlier.status == "FINISHED":

@@ -136,7 +136,7 @@ def _fault(file: BinaryIO) -> str | None:
     file.seek(max(0, size - TRAILER))
     mark, stored_digest = file.read(len(MARK)), file.read()
     if mark != MARK:
-        return "the file is cut short, or it is no checkpoint of this framework"
+        return "the file is cut short, or it is not a checkpoint of this framework"
     file.seek(0)
     digest = hashlib.sha256()
     rest = size - TRAILER

@@ -31,8 +31,8 @@ def require_enclosed(folder: Path, error: type[UserError] = DataError) -> None:
         error: Class of the error.
 
     Raises:
-        error: An entry is a link, has a second name elsewhere (a hard link), or is no regular file. The message names
-            the first such entry.
+        error: An entry is a link, has a second name elsewhere (a hard link), or is not a regular file. The message
+            names the first such entry.
     """
     if not folder.exists():
         return
@@ -86,7 +86,7 @@ def open_plain(path: Path, flags: int) -> int:
     `flags` must not contain O_TRUNC, which would truncate the file before this function has checked it.
 
     Raises:
-        DataError: The entry is a link, has a second name elsewhere (a hard link), or is no regular file.
+        DataError: The entry is a link, has a second name elsewhere (a hard link), or is not a regular file.
         OSError: The file cannot be opened.
     """
     assert not flags & os.O_TRUNC

@@ -42,7 +42,7 @@ def ensure_generated(root: Path, mark: Mapping[str, Any], write: Callable[[Path]
         ) from error
     if read_mark(root) != mark:
         raise DataError(
-            f"{root / MARK} does not describe {dict(mark)}, so it was changed. Delete {root}; the data are then "
+            f"{root / MARK} does not describe {dict(mark)}, so this file was changed. Delete {root}; the data are then "
             "generated again."
         )
     return root

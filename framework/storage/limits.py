@@ -10,7 +10,7 @@ BUILDING_TIMES, BUILDING_BYTES = 8, 2**27
 """Limit on the memory for building a stored model: BUILDING_TIMES × the bytes of its weights, plus BUILDING_BYTES.
 
 The weights of ensemble members that are computed together are allocated twice, and orthogonal initial weights three
-times. Basis point sets and tables of constants take memory although they are no weights.
+times. Basis point sets and tables of constants take memory although they are not weights.
 """
 CALLS_PER_WEIGHT, BUILDING_CALLS = 200, 10_000
 """Limit on torch's operations for building a stored model: CALLS_PER_WEIGHT for each tensor, plus BUILDING_CALLS.

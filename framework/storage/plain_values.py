@@ -72,7 +72,7 @@ def read_yaml(file: Path, expected: str, remedy: str = RESTORE, error: type[User
 
 
 def is_number(value: Any) -> TypeGuard[int | float]:
-    """Return whether a value of JSON or YAML is a number; true and false are no numbers here, unlike in Python."""
+    """Return whether a value of JSON or YAML is a number; true and false are not numbers here, unlike in Python."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
@@ -82,7 +82,7 @@ def plain_numbers(value: Any) -> Any:
     The check is needed because NumPy and torch also accept true and text.
 
     Raises:
-        ValueError: An item is no number; the message quotes it.
+        ValueError: An item is not a number; the message quotes it.
     """
     if isinstance(value, list | tuple):
         return [plain_numbers(item) for item in value]
@@ -202,7 +202,7 @@ def require_plain_pickle(pickled: bytes, called: Collection[str] = (), named: Co
             arguments, function = stack.pop(), stack.pop()
             if function.name not in called:
                 raise Foreign(
-                    f"the pickle calls {function.name or 'an object that is no function'}, which is not allowed"
+                    f"the pickle calls {function.name or 'an object that is not a function'}, which is not allowed"
                 )
             if function.name == ENCODE and arguments.text != "latin1":  # some codecs take quadratic time
                 raise Foreign("the pickle builds bytes in a way that Python's pickle module does not use")

@@ -29,7 +29,7 @@ LOOKED_AT = 64
 MINUS = str.maketrans(
     dict.fromkeys("\N{MINUS SIGN}\N{EN DASH}\N{SMALL HYPHEN-MINUS}\N{FULLWIDTH HYPHEN-MINUS}", "-")
 )
-"""Characters that mean a minus at the beginning of a number. A word such as 1–5, a range, is no number."""
+"""Characters that mean a minus at the beginning of a number. A word such as 1–5, a range, is not a number."""
 NOT_FINITE = re.compile(r"[+-]?1\.#([A-Za-z]+)\d*")
 """Pattern of NaN and infinity as Microsoft's C library writes them: 1.#INF, -1.#IND, 1.#QNAN, sometimes truncated."""
 FORTRAN = re.compile(r"([+-]?(?:\d+\.\d*|\.\d+))[dD]([+-]?\d+)|([+-]?\d+)[dD]([+-]\d+)")
@@ -120,7 +120,7 @@ def require_distinct(names: Sequence[str], kind: str = "column") -> None:
 
 
 def parse_number(word: str) -> float | None:
-    """Return the number that a word represents, which may be NaN or infinite, or None if the word is no number.
+    """Return the number that a word represents, which may be NaN or infinite, or None if the word is not a number.
 
     In addition to the forms of Python, the function reads a Unicode minus, Fortran's 1.5D+3, and 1.#INF or -1.#IND of
     Microsoft's C library.
@@ -271,7 +271,7 @@ def require_numbers_in(words: Sequence[str], text: str, first: int = 0) -> list[
         first: Index of `words[0]` among all words of `text`.
 
     Raises:
-        ValueError: A word is no number; the message names its line.
+        ValueError: A word is not a number; the message names its line.
     """
     try:
         numbers = list(map(float, words))
@@ -287,7 +287,7 @@ def require_numbers_in(words: Sequence[str], text: str, first: int = 0) -> list[
 
 
 def describe_no_number(word: str, where: str = "") -> str:
-    """Return the error message for a word that is no number, with a correction if there is one."""
+    """Return the error message for a word that is not a number, with a correction if there is one."""
     remedy = suggest_number(word)
     why = f", which is a number {remedy.form}; write {remedy.number}" if remedy else ""
     return f"expected a number, got {quote(word)}{where}{why}"

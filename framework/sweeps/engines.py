@@ -23,7 +23,7 @@ class Engine(Protocol):
     Attributes:
         threads: Number of threads of each job, for which `OMP_NUM_THREADS` is set unless the user has set it.
         interval: Seconds between two looks at the running jobs.
-        outlives: Whether its jobs go on when the launcher has ended.
+        outlives: Whether the engine's jobs continue when the launcher has ended.
     """
 
     threads: int

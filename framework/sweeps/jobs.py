@@ -28,7 +28,7 @@ from framework.sweeps.sending import JournalSender
 from framework.tracking.signals import CLOSED, ENDING, SIGNALS, Stopped, collected_signals, ends_with_parent
 
 COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework")
-"""Command of a job, to which its overrides are added. It is no setting, because a config must not run code."""
+"""Command of a job, to which its overrides are added. It is not a setting, because a config must not run code."""
 MOST_LISTED = 8
 """Largest number of jobs with the same error whose numbers are listed."""
 MOST_LOSSES = 3

@@ -1,4 +1,4 @@
-"""A job of a sweep where a cluster runs it: it runs only if its record still names it, and leaves a file of its end.
+"""Job of a sweep on a cluster's node: it runs only if its record still names it, and writes a file about its end.
 
 The folder of the sweep is on a file system that all nodes share. A node and the launcher exchange nothing but files of
 the job's folder. The record job.json belongs to the launcher, and node.json belongs to the node.

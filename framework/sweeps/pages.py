@@ -206,7 +206,7 @@ def _differences(compared: Comparison) -> str:
     heads = ["row", "seeds", *(compared.columns[name] for name in keys)]
     return paragraph(
         f"Each number is that of a row minus that of “{names[best]}”, which has the best {compared.columns[key]}, with "
-        "the same seed. The best row was chosen by the same numbers, so small differences from it are no proof."
+        "the same seed. The best row was chosen by the same numbers, so small differences from it are not proof."
     ) + plain_table(heads, lines, caption)
 
 

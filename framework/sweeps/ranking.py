@@ -266,7 +266,7 @@ def _explain(trials: Sequence[Trial], measured: Measured, finite: Sequence[bool]
     if tested:
         console.print(
             f"{' and '.join(tested)} was computed on the test split, which was used to choose the trial, so the best "
-            "value is no estimate for new data.",
+            "value is not an estimate for new data.",
             soft_wrap=True,
         )
 

@@ -68,7 +68,7 @@ def compare(runs: Sequence[Mapping[str, Any]], overrides: Sequence[Sequence[str]
 
 
 def headline(compared: Comparison) -> str | None:
-    """Return the key of the first number with a known direction that is no cost and that all rows have."""
+    """Return the key of the first number with a known direction that is not a cost and that all rows have."""
     keys = (key for key in compared.runs[0]["columns"] if key in compared.better)
     return next((key for key in keys if all(key in row for row in compared.rows)), None)
 

@@ -42,12 +42,14 @@ from framework.testing.protocol_checks import (
 from framework.testing.quadrature import cells, cells_around_draws, count_samples, density_at, side
 
 DRAWS = 20_000
-UNSEEN = 3.3
-"""Events in draws that averages over draws may miss, as a share of the limit of 6: 20 are missed with probability e⁻²⁰.
-
-Averages of numbers that are nearly always 0 have too small an estimated variance.
-"""
 """Number of draws that are compared with a density."""
+UNSEEN = 3.3
+"""Number of draws that, divided by DRAWS, is added to the standard error of an average over draws.
+
+If the averaged numbers are nearly always 0, all rare draws may be missing, and the estimated standard error is too
+small. Draws that are expected 20 times are missing with probability e⁻²⁰. The limit of 6 standard errors allows for
+6 · UNSEEN = 20 missing draws.
+"""
 SCALES = (1e-2, 0.1, 1.0, 10.0, 1e2, 1e3)
 """Standard deviations of the random raw parameters at which densities are checked, in addition to the row's `scale`."""
 GRID = 2880

@@ -87,7 +87,7 @@ class OneDevice(TorchFunctionMode):
                 part._device = DEVICE  # type: ignore[assignment]
 
     def label_cpu(self, value: Any) -> None:
-        """Label every tensor in a value as on the CPU, for example attributes of an object that no call moves."""
+        """Label every tensor in a value, such as an attribute that `Module.to` does not move, as on the CPU."""
         for tensor in tensors_in(value):
             _on_device[tensor] = False
 

@@ -75,7 +75,7 @@ def confirm_address(recorded: str, named: str | None, folder: Path, source: Path
         source: Path of the file, for the message.
 
     Raises:
-        ConfigError: Neither an address that the user gives nor a default address is that of the recorded store.
+        ConfigError: Neither an address that the user gives nor a default address names the recorded store.
     """
     candidates = [Address(store_uri(uri), True) for uri in (named, os.environ.get(SETTING)) if uri]
     candidates += [Address(default_uri(place), False) for place in (folder, Path.cwd() / "outputs" / "run")]

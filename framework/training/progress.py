@@ -19,7 +19,7 @@ class Progress(BatchCallback):
 
     Args:
         console: the console to write to; it is quiet in all ranks but the first.
-        seconds: time between two lines within a long epoch, if the console is no terminal.
+        seconds: time between two lines within a long epoch, if the console is not a terminal.
     """
 
     def __init__(self, console: Console, seconds: float = 30.0) -> None:

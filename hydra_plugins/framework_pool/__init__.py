@@ -362,7 +362,7 @@ def _remove_empty_sweep(folder: Path) -> None:
 
 
 def _job_return(job: sweep.Job, failure: Exception | None) -> JobReturn:
-    # a job that goes on without this command has no value yet, and is no failure
+    # a job that goes on without this command has no value yet, and is not a failure
     status = JobStatus.COMPLETED if job.completed or job.is_elsewhere else JobStatus.FAILED
     job_return = JobReturn(overrides=job.overrides, working_dir=str(job.folder), status=status)
     job_return.return_value = job.value() if job.completed else None if job.is_elsewhere else failure

@@ -14,7 +14,7 @@ from rich.console import Console
 from framework.storage.files import write_whole
 
 OF_THE_RUN = ("logger", "mode", "debug", "threads", "workers", "resume")
-"""Keys that do not change the results of a trial; they are no part of the experiment and stay on the command line."""
+"""Keys that do not change the results of a trial; they are not part of the experiment and stay on the command line."""
 
 
 def counts(key: str) -> bool:

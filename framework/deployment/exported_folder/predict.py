@@ -186,7 +186,7 @@ def read_csv(file: Path, columns: list[str]) -> NDArray[np.float64]:
     """Return the named columns of a CSV file with a header, (row, column).
 
     Raises:
-        ValueError: a column is missing, or a cell is no number.
+        ValueError: a column is missing, or a cell is not a number.
     """
     with file.open(encoding="utf-8-sig", newline="") as stream:
         reader = csv.DictReader(stream)
@@ -201,7 +201,7 @@ def read_csv(file: Path, columns: list[str]) -> NDArray[np.float64]:
                 rows.append([float(line[name]) for name in columns])
             except (TypeError, ValueError):
                 raise ValueError(
-                    f"{file}, line {reader.line_num}: a cell is no number. Correct the line."
+                    f"{file}, line {reader.line_num}: a cell is not a number. Correct the line."
                 ) from None
     return np.array(rows, dtype=np.float64).reshape(-1, len(columns))
 
@@ -210,14 +210,14 @@ def padded(clouds: Any) -> NDArray[Any]:
     """Return point clouds as one array (batch, points, column); smaller clouds end with rows of NaN.
 
     Raises:
-        ValueError: the clouds have different numbers of columns, or are no arrays of numbers.
+        ValueError: the clouds have different numbers of columns, or are not arrays of numbers.
     """
     if isinstance(clouds, np.ndarray):
         return clouds
     try:
         arrays = [np.asarray(cloud, dtype=np.float64) for cloud in clouds]
     except (TypeError, ValueError, OverflowError):
-        raise ValueError("A cloud is no array of numbers (point, column). Correct the input.") from None
+        raise ValueError("A cloud is not an array of numbers (point, column). Correct the input.") from None
     if not arrays or any(array.ndim != 2 or array.shape[1:] != arrays[0].shape[1:] for array in arrays):
         raise ValueError("Clouds must be arrays of numbers (point, column), all with the same columns.")
     shape = (len(arrays), max(len(array) for array in arrays), arrays[0].shape[1])
@@ -232,7 +232,7 @@ def _draw(entry: Mapping[str, Any], generator: np.random.Generator) -> NDArray[A
     shape = [size if isinstance(size, int) else int(size.partition(" ")[0]) for size in entry["shape"]]
     dtype = np.dtype(entry["dtype"])
     if entry["kind"] == "uniform":
-        # rounding to float32 may give 1, which is no number of the interval
+        # rounding to float32 may give 1, which is not a number of the interval
         return np.minimum(generator.random(shape).astype(dtype), np.nextafter(dtype.type(1), dtype.type(0)))
     return generator.standard_normal(shape).astype(dtype)
 
@@ -257,7 +257,7 @@ def _require_clouds(array: NDArray[Any]) -> None:
 
 
 def _require_bytes(array: NDArray[Any]) -> None:
-    """Raise an error if numbers of an image are no integers from 0 to 255."""
+    """Raise an error if numbers of an image are not integers from 0 to 255."""
     with np.errstate(invalid="ignore"):
         if not ((array >= 0) & (array <= 255) & (array == np.floor(array))).all():
             raise ValueError("The pixels of images must be integers from 0 to 255.")

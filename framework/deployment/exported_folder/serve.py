@@ -112,9 +112,7 @@ def read_npy(content: bytes) -> Any:
     except Exception:  # the parser raises errors of many kinds
         raise ValueError("The body is no .npy file.") from None
     if dtype.kind not in "buif" or (fortran and len(shape) > 1):
-        raise ValueError(
-            f"The .npy file holds {dtype} in an order that is not read; expected numbers in C order."
-        )
+        raise ValueError(f"The .npy file holds {dtype} in an unsupported order; expected numbers in C order.")
     if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != len(content) - stream.tell():
         raise ValueError("The .npy file has another length than its shape says.")
     return np.frombuffer(content, dtype, offset=stream.tell()).reshape(shape)
@@ -125,7 +123,7 @@ def _read_json(content: bytes) -> tuple[Any, Any]:
     try:
         request = json.loads(content)
     except UnicodeDecodeError:
-        raise ValueError("The body is no JSON in UTF-8.") from None
+        raise ValueError("The body is not JSON in UTF-8.") from None
     if not isinstance(request, dict) or "inputs" not in request or set(request) - {"inputs", "interval"}:
         raise ValueError('Expected {"inputs": [...], "interval": 0.9}; interval may be left out.')
     if not isinstance(request["inputs"], list):

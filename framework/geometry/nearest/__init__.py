@@ -365,7 +365,7 @@ def offsets(
     index = nearest(clouds, queries, sizes, query_sizes).index
     real = None if query_sizes is None else point_mask(queries, query_sizes)[..., None]
     if real is not None:
-        queries = queries.where(real, 0)  # before anything is subtracted: NaN × 0 is no gradient
+        queries = queries.where(real, 0)  # before anything is subtracted: NaN × 0 is not a gradient
     vectors = queries - clouds.gather(1, index[..., None].expand(-1, -1, 3))
     return vectors if real is None else vectors.where(real, 0)
 

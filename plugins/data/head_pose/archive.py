@@ -96,7 +96,7 @@ class Source:
     def _check(self, root: Path) -> None:
         if not root.is_dir():
             raise DataError(
-                f"data.root = {root} does not exist or is no folder. Set data.root to the unpacked "
+                f"data.root = {root} does not exist or is not a folder. Set data.root to the unpacked "
                 f"{self.archive.folder}, or to null for synthetic images."
             )
         missing = [
@@ -118,7 +118,7 @@ def wrong_layout(root: Path, folder: str, fault: str) -> DataError:
     """
     inner = root / folder
     remedy = f"Did you mean {inner}?" if inner.is_dir() else "Unpack the whole archive into this folder."
-    return DataError(f"data.root = {root} has not the layout of {folder}: {fault}. {remedy}")
+    return DataError(f"data.root = {root} does not have the layout of {folder}: {fault}. {remedy}")
 
 
 def draw_train_and_test(

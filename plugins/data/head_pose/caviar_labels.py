@@ -33,7 +33,7 @@ def read_labels(file: Path) -> dict[str, list[Label]]:
     """Return the labels of "train" and "test", in the order of the file.
 
     Raises:
-        DataError: The file cannot be read, lacks a struct array, or an element of the array is no label.
+        DataError: The file cannot be read, lacks a struct array, or an element of the array is not a label.
     """
     names = [f"or_label_{split}" for split in TRAIN_AND_TEST]
     content = read_variables(file, names)

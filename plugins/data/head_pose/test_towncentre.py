@@ -149,7 +149,9 @@ def test_pan_that_is_not_finite_is_refused(root: Path) -> None:
 def test_the_message_about_a_wrong_layout_names_the_fault_and_the_remedy(root: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"nowhere does not exist .* Set data\.root to the unpacked Town"):
         prepare_data("towncentre", tmp_path / "nowhere")
-    with pytest.raises(DataError, match=r"has not the layout of .* Did you mean .*TownCentreHeadImages\?"):
+    with pytest.raises(
+        DataError, match=r"does not have the layout of .* Did you mean .*TownCentreHeadImages\?"
+    ):
         prepare_data("towncentre", tmp_path)
     with pytest.raises(
         DataError, match=r"none of its folders holds a label file .* Unpack the whole archive"

@@ -87,7 +87,7 @@ def read_label(file: Path) -> tuple[float, bool]:
         line = next((number for number, (name, _, _) in enumerate(entries, 1) if name.strip() == "pan"), 0)
         reason = f" Line {line}: {describe_no_number(fields['pan'])}." if pan is None and line else ""
         raise DataError(
-            f"{file}: {quote(text)} is no label. Two lines are expected, `pan = ` with finite degrees and "
+            f"{file}: {quote(text)} is not a label. Two lines are expected, `pan = ` with finite degrees and "
             f"`valid = ` with 0 or 1.{reason} Copy the file again from its source."
         )
     return pan, valid

@@ -181,7 +181,7 @@ def _select_subject(who: str | None, names: Sequence[str]) -> str:
     if name not in names:
         raise DataError(
             f"There is no test subject {name!r}.{did_you_mean(name, names)} The test subjects are {', '.join(names)}. "
-            "The file of a mesh needs its suffix, as in ann.ply."
+            "To animate the mesh in a file, give the file with its suffix, as in ann.ply."
         )
     return name
 

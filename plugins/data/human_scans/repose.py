@@ -102,7 +102,7 @@ def a_pose_with(changes: str) -> Float[np.ndarray, "1 movement"]:
     """Return the movements, degrees, of an A-pose with some of them replaced: "left raise=90,left elbow=60".
 
     Raises:
-        DataError: no movement has such a name, or an angle is no number.
+        DataError: no movement has such a name, or an angle is not a number.
     """
     ranges = [*poses.CENTRAL.values(), *2 * (*poses.SIDED.values(),)]
     movements = dict(zip(poses.MOVEMENTS, (float(limits[0]) for limits in ranges), strict=True))
@@ -167,7 +167,7 @@ def shape_change(text: str, count: int) -> Float[Tensor, "shape"]:
     for name, number in _numbers(text).items():
         if not name.isdecimal() or int(name) >= count:
             raise DataError(
-                f"--shape {text}: {name!r} is no direction; expected a number from 0 to {count - 1}, as in 0=-2."
+                f"--shape {text}: {name!r} is not a direction; expected a number from 0 to {count - 1}, as in 0=-2."
             )
         coefficients[int(name)] = number
     return coefficients

@@ -37,7 +37,7 @@ def content(file: Path) -> bytes:
     """Return the whole content of a skin's file.
 
     Raises:
-        DataError: the file is missing, or is no regular file.
+        DataError: the file is missing, or is not a regular file.
     """
     with translate_errors(file, "an image of skin"):
         return read_bytes(file)

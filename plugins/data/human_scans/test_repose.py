@@ -221,7 +221,7 @@ WRONG = {
     "no movement": (["--pose", "left elbw=3"], "no movement 'left elbw'. Did you mean 'left elbow'"),
     "no number": (["--pose", "left elbow"], "expected a name and a number"),
     "infinite": (["--pose", "left elbow=inf"], "from -10000 to 10000"),
-    "no direction": (["--shape", "4=1"], "'4' is no direction; expected a number from 0 to 3"),
+    "no direction": (["--shape", "4=1"], "'4' is not a direction; expected a number from 0 to 3"),
     "no file": (["--motion", "none.bvh"], "none.bvh: no such file"),
     "another body": ([], "the mesh has 40 vertices, but the meshes of"),
     "twice": (["ann"], "the name ann occurs twice"),

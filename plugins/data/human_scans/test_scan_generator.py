@@ -53,7 +53,7 @@ def test_registrations_are_near_the_body_and_scans_are_not_registrations(wardrob
     median, largest = np.array(gaps).T
     assert (median < 0.01).all()  # the registration follows the scan
     assert (largest > 0.01).mean() > 0.6  # hair, hems and skirts are only in the scan
-    # some people have skirts or long hair, which are no part of the body's mesh
+    # some people have skirts or long hair, which are not part of the body's mesh
     assert 0.2 < np.mean([len(scan.vertices) > len(bare) for scan, _ in dressed]) < 1
 
 

@@ -226,7 +226,7 @@ def find_folder(root: str | None) -> Path:
         raise DataError(f"data.root is not set. {remedy}")
     folder = Path(root).expanduser()
     if not folder.is_dir():
-        raise DataError(f"data.root = {folder} does not exist or is no folder. {remedy}")
+        raise DataError(f"data.root = {folder} does not exist or is not a folder. {remedy}")
     return folder
 
 

@@ -148,7 +148,7 @@ def test_mistakes_in_settings_are_named(tmp_path: Path, settings: dict[str, Any]
         ("file,class\n000.png,cat", "has no column `label`"),
         ("file,label\n000.png,cat\n001.png,", "line 3: The column `label` is "),
         ("file,label\n000.png,cat\n./000.png,dog", "line 3: './000.png' is already listed in line 2"),
-        ("file,label,split\n000.png,cat,tset", "'tset' is no split"),
+        ("file,label,split\n000.png,cat,tset", "'tset' is not a split"),
     ],
 )
 def test_mistakes_in_a_table_are_named(tmp_path: Path, table: str, message: str) -> None:

@@ -74,8 +74,8 @@ class ImagesWithAngles(Data):
         for name in self.mirror:
             if name not in table.columns:
                 raise DataError(
-                    f"data.mirror names {name!r}, which is no angle of the table.{did_you_mean(name, table.columns)} "
-                    f"The angles are {', '.join(table.columns)}."
+                    f"data.mirror names {name!r}, which is not an angle of the table."
+                    f"{did_you_mean(name, table.columns)} The angles are {', '.join(table.columns)}."
                 )
         self.target = Target("angle", table.columns)
         self.input_shape = (self.channels, self.image_size, self.image_size)
@@ -108,7 +108,7 @@ class ImagesWithAngles(Data):
         root = Path(self.root).expanduser()
         if not root.is_dir():
             raise DataError(
-                f"data.root = {root} does not exist or is no folder. Set data.root to the folder of your images."
+                f"data.root = {root} does not exist or is not a folder. Set data.root to the folder of your images."
             )
         return root, read_table(root / self.csv, self.angle_columns, self.angles_in, self.writing)
 

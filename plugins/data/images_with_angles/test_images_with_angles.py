@@ -96,11 +96,11 @@ def table_with(line: str, header: str = "file,pan,tilt", index: int = 3) -> str:
         ("file,pan", r"no row below its first line, but one row per sample is expected"),
         ("file,pan,pan\n000.png,3,4", r"the column 'pan' is named twice"),
         ("file,note\n000.png,hello", r"has no column of numbers besides `file` and `split`"),
-        (table_with("777.png,abc,4"), r"line 5, column 'pan': 'abc' is no finite number"),
-        (table_with("777.png,,4"), r"line 5, column 'pan': '' is no finite number"),
-        (table_with("777.png,1_0,4"), r"line 5, column 'pan': '1_0' is no finite number"),
-        (table_with("777.png,3,nan"), r"line 5, column 'tilt': 'nan' is no finite number"),
-        (table_with("777.png,-inf,3"), r"line 5, column 'pan': '-inf' is no finite number"),
+        (table_with("777.png,abc,4"), r"line 5, column 'pan': 'abc' is not a finite number"),
+        (table_with("777.png,,4"), r"line 5, column 'pan': '' is not a finite number"),
+        (table_with("777.png,1_0,4"), r"line 5, column 'pan': '1_0' is not a finite number"),
+        (table_with("777.png,3,nan"), r"line 5, column 'tilt': 'nan' is not a finite number"),
+        (table_with("777.png,-inf,3"), r"line 5, column 'pan': '-inf' is not a finite number"),
         (table_with("777.png,3"), r"line 5: the line has 2 cells, but the first line names 3"),
         (table_with("777.png,3,4,5"), r"line 5: the line has 4 cells, but the first line names 3"),
         (table_with("  ,3,4"), r"line 5: The column `file` is empty\. Write the name of an image"),
@@ -110,7 +110,7 @@ def table_with(line: str, header: str = "file,pan,tilt", index: int = 3) -> str:
         ('file,pan\n"000.png,3', r"cannot be read .* Save it as UTF-8 text"),
         (
             "file,pan,split\n000.png,3,trian",
-            r"line 2, column `split`: 'trian' is no split.* Did you mean 'train'\?",
+            r"line 2, column `split`: 'trian' is not a split.* Did you mean 'train'\?",
         ),
         (
             "file,pan,split\n000.png,3,train",
@@ -130,12 +130,13 @@ def test_messages_about_missing_names_suggest_a_remedy(tmp_path: Path) -> None:
         DataError, match=r"names the column 'pam', which .* does not have\. Did you mean 'pan'\?"
     ):
         prepare_data(tmp_path, angle_columns=["pam"])
-    with pytest.raises(DataError, match=r"column 'note': 'text' is no finite number"):
+    with pytest.raises(DataError, match=r"column 'note': 'text' is not a finite number"):
         prepare_data(tmp_path, angle_columns=["note"])
     with pytest.raises(DataError, match="angle_columns is empty"):
         prepare_data(tmp_path, angle_columns=[])
     with pytest.raises(
-        DataError, match=r"data\.mirror names 'pam', which is no angle of the table\. Did you mean 'pan'\?"
+        DataError,
+        match=r"data\.mirror names 'pam', which is not an angle of the table\. Did you mean 'pan'\?",
     ):
         prepare_data(tmp_path, mirror=["pam"])
     (tmp_path / "angles.csv").write_bytes("file,pan\nä.png,3".encode("latin-1"))

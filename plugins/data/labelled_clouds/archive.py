@@ -40,7 +40,7 @@ def read_archive(root: str | None) -> Archive:
     """Read and check the whole archive.
 
     Raises:
-        DataError: The root is not set or is no archive; an array is missing or of another shape; offsets do not rise;
+        DataError: The root is not set or not an archive; an array is missing or of another shape; offsets do not rise;
             a label has no class; or a coordinate is not finite. The message names the object.
     """
     if root is None:

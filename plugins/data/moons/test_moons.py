@@ -266,7 +266,7 @@ def test_a_users_points_are_read_without_prepare(name: str, tmp_path: Path) -> N
     assert read.fields["input"].tolist() == [[1, 2], [0.5, -4000], [7, 8]]
     assert read.fields["input"].dtype == torch.float32
     (tmp_path / "a.csv").write_text("x,y\n1,2\n1,two\n")
-    with pytest.raises(DataError, match=r"a\.csv line 3, column 'y': 'two' is no finite number"):
+    with pytest.raises(DataError, match=r"a\.csv line 3, column 'y': 'two' is not a finite number"):
         data.read([tmp_path / "a.csv"])
     (tmp_path / "a.csv").write_text("x,z\n1,2\n")
     with pytest.raises(DataError, match=r"names the column 'y', which .*a\.csv does not have"):

@@ -177,7 +177,7 @@ class Pascal3D(Data):
         for category in self.categories:
             if category not in CLASSES:
                 raise DataError(
-                    f"data.category = {category!r} is no class of PASCAL3D+."
+                    f"data.category = {category!r} is not a class of PASCAL3D+."
                     f"{did_you_mean(category, CLASSES)} Choose one or more of {', '.join(CLASSES)}."
                 )
         if not self.categories:

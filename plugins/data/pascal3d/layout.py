@@ -61,8 +61,8 @@ def check_root(root: Path, category: str) -> None:
     """
     if not root.is_dir():
         raise DataError(
-            f"data.root = {root} does not exist or is no folder. Set data.root to the unpacked PASCAL3D+_release1.1, "
-            "or to null for synthetic images."
+            f"data.root = {root} does not exist or is not a folder. Set data.root to the unpacked "
+            "PASCAL3D+_release1.1, or to null for synthetic images."
         )
     folders = [Path(top, f"{category}_{source}") for top in ("Annotations", "Images") for source in SUFFIXES]
     lists = [name for names in split_lists(category).values() for _, name in names]
@@ -72,7 +72,8 @@ def check_root(root: Path, category: str) -> None:
         inner = [child.name for child in sorted(root.iterdir()) if (child / "Annotations").is_dir()]
         hint = f"Did you mean {root / inner[0]}?" if inner else "Unpack the whole release into this folder."
         raise DataError(
-            f"data.root = {root} has not the layout of PASCAL3D+ release 1.1: it holds no {', no '.join(missing)}. "
+            f"data.root = {root} does not have the layout of PASCAL3D+ release 1.1: it holds no "
+            f"{', no '.join(missing)}. "
             f"{hint}"
         )
 
@@ -166,7 +167,7 @@ def _load(file: Path) -> Struct:
     record = read_variables(file, ["record"], "Copy it again from the release.").get("record")
     if not isinstance(record, dict):
         raise DataError(
-            f"{file}: The file holds no struct `record`, so it is no PASCAL3D+ annotation. Copy it again from the "
+            f"{file}: The file holds no struct `record`, so it is not a PASCAL3D+ annotation. Copy it again from the "
             "release."
         )
     return record

@@ -279,7 +279,7 @@ def test_the_mark_describes_the_generated_set_and_must_not_change(tmp_path: Path
     assert mark["generator_version"] == generator.VERSION
     assert mark["symmetry"] == {"bottle": 0}
     (root / generated.MARK).write_text(json.dumps({**mark, "seed": 4}), encoding="utf-8")
-    with pytest.raises(DataError, match=r"it was changed\. Delete"):
+    with pytest.raises(DataError, match=r"so this file was changed\. Delete"):
         generator.generate_class(tmp_path, "bottle", 20, 3, renderer)
 
 

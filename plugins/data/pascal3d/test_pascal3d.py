@@ -438,7 +438,7 @@ def test_the_message_about_a_wrong_layout_names_the_fault_and_a_remedy(root: Pat
 
 def test_a_misspelt_class_and_an_empty_list_are_refused(shared_root: Path) -> None:
     with pytest.raises(
-        DataError, match=r"'motorbyke' is no class of PASCAL3D\+\. Did you mean 'motorbike'\?"
+        DataError, match=r"'motorbyke' is not a class of PASCAL3D\+\. Did you mean 'motorbike'\?"
     ):
         prepare_data(shared_root, category="motorbyke")
     with pytest.raises(DataError, match="category is empty"):

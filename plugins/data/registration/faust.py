@@ -76,7 +76,7 @@ def pairs(folder: Path, challenge: Challenge) -> list[Pair]:
     """Return the pairs of scans of a challenge: of one person ("intra") or of two ("inter").
 
     Raises:
-        DataError: the list does not exist, a line is no pair, or a scan of a pair does not exist.
+        DataError: the list does not exist, a line is not a pair, or a scan of a pair does not exist.
     """
     file = pairs_file(folder, challenge)
     with translate_errors(file, "pairs of a challenge", "Expected: two test scans a line, such as 000_001."):

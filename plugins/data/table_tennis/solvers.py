@@ -21,7 +21,7 @@ EXPLICIT = ("RK45", "DOP853")
 MOST_PHASES = 1000
 """Largest number of phases, of free flight and of contact, in one flight."""
 REST = 1e-6
-"""Upward speed, m/s, below which a ball comes to rest instead of bouncing, if the table is no spring."""
+"""Upward speed, m/s, below which a ball comes to rest instead of bouncing, if the table is not a spring."""
 
 
 class SolverGaveUp(UserError):

@@ -94,7 +94,7 @@ def levels_in_memory(user_data: Any, names: Sequence[str]) -> dict[str, np.ndarr
 
 
 def report_unknown(unknown: Mapping[str, int], column: str) -> None:
-    """Log a warning about levels that the model does not know; there is none if `unknown` is empty."""
+    """Log a warning about levels that the model does not know; do nothing if `unknown` is empty."""
     if unknown:
         _log.warning(
             "tabular: %d rows have levels in the column %s that the training table does not have, such as %s; they "

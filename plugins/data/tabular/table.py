@@ -216,7 +216,7 @@ def read(files: Sequence[Path], columns: InputColumns, writing: Writing | None =
     """Return the input columns of further files with the scaling of the training rows, one sample for each row.
 
     Raises:
-        DataError: There is no file, or a file cannot be read, lacks a column, or has a cell that is no finite number.
+        DataError: There is no file, a file cannot be read or lacks a column, or a cell is not a finite number.
     """
     parts = []
     notation, setting = writing or LabelledWriting(), "The trained model"
@@ -257,7 +257,7 @@ def from_memory(user_data: Any, columns: InputColumns) -> Float[Tensor, "row col
     if len(wrong):
         row, column = wrong[0]
         raise DataError(
-            f"Row {row}, column {columns.names[column]!r}: {rows[row, column]} is no finite number within single "
+            f"Row {row}, column {columns.names[column]!r}: {rows[row, column]} is not a finite number within single "
             "precision. Correct the number, or leave the row out."
         )
     return torch.from_numpy(scaled.astype(np.float32))
@@ -435,7 +435,7 @@ def _splits(cells: Columns, rows: np.ndarray, question: Question) -> Int[np.ndar
         for row, word in enumerate(cells.cells[SPLIT]):
             if word not in SPLITS:
                 raise DataError(
-                    f"{cells.file} line {cells.lines[row]}, column `{SPLIT}`: {word!r} is no split. Write one of "
+                    f"{cells.file} line {cells.lines[row]}, column `{SPLIT}`: {word!r} is not a split. Write one of "
                     f"{', '.join(SPLITS)}.{did_you_mean(word, SPLITS)}"
                 )
         split = np.array([SPLITS.index(cells.cells[SPLIT][row]) for row in rows], dtype=np.int64)
@@ -505,7 +505,7 @@ def _check_labels(
     fractional = any(value is not None and not value.is_integer() for value in numeric_values)
     if numeric and len(labels) > (MANY_LABELS if fractional else max(MANY_LABELS, len(rows) / 2)):
         raise DataError(
-            f"{cells.file}, column {name!r}: {len(labels)} different numbers in {len(rows)} rows are no classes. Set "
+            f"{cells.file}, column {name!r}: {len(labels)} different numbers in {len(rows)} rows are not classes. Set "
             "data.kind=real or data.kind=degrees, or name another data.target."
         )
     spelling: dict[float, str] = {}

@@ -152,13 +152,13 @@ def with_cell(cell: str, line: int = 5, column: int = 0) -> str:
             r"data\.target names the column 'class', which .*mine\.csv does not have\. Did you mean 'klass'\?",
         ),
         ("word,class\na,b\nc,d", "has no column of numbers besides class"),
-        (with_cell("abc"), r"mine\.csv line 5, column 'x': 'abc' is no finite number"),
+        (with_cell("abc"), r"mine\.csv line 5, column 'x': 'abc' is not a finite number"),
         (
             with_cell(""),
-            r"line 5, column 'x': '' is no finite number.* Or set data\.missing=skip to leave such rows out",
+            r"line 5, column 'x': '' is not a finite number.* Or set data\.missing=skip to leave such rows out",
         ),
-        (with_cell("nan", 7, 1), r"line 7, column 'y': 'nan' is no finite number"),
-        (with_cell("-inf", 7, 1), r"line 7, column 'y': '-inf' is no finite number"),
+        (with_cell("nan", 7, 1), r"line 7, column 'y': 'nan' is not a finite number"),
+        (with_cell("-inf", 7, 1), r"line 7, column 'y': '-inf' is not a finite number"),
         (with_cell("1,2"), r"line 5: the line has 4 cells, but the first line names 3"),
         (
             with_cell("", 9, 2),
@@ -168,13 +168,13 @@ def with_cell(cell: str, line: int = 5, column: int = 0) -> str:
         (with_cell("c", 4, 2), r"line 4, column 'class': No training row has the label 'c'"),
         (
             "x,class\n" + "\n".join(f"{row},{row / 7}" for row in range(50)),
-            r"50 different numbers in 50 rows are no classes\. Set data\.kind=real",
+            r"50 different numbers in 50 rows are not classes\. Set data\.kind=real",
         ),
         ("x,class\n1,a\n2,b", r"The validation split is empty \(2 rows are used, 0 are left out"),
         ("split,x,class\ntrain,1,a\ntest,2,b", r"The validation split is empty .* column `split`"),
         (
             "split,x,class\ntrain,1,a\ntset,2,b",
-            r"line 3, column `split`: 'tset' is no split\. .* Did you mean 'test'\?",
+            r"line 3, column `split`: 'tset' is not a split\. .* Did you mean 'test'\?",
         ),
         ("group,x,class\na,1,a\n,2,b", r"line 3, column `group`: The name is missing"),
         (
@@ -257,9 +257,9 @@ def test_settings_that_do_not_fit_the_table_are_refused(tmp_path: Path) -> None:
         prepare_data(file, columns=["nomber"])
     with pytest.raises(DataError, match=r"data\.columns names 'class', but this column is the target"):
         prepare_data(file, columns=["number", "class"])
-    with pytest.raises(DataError, match=r"line 2, column 'word': 'a' is no finite number"):
+    with pytest.raises(DataError, match=r"line 2, column 'word': 'a' is not a finite number"):
         prepare_data(file, columns=["word"])
-    with pytest.raises(DataError, match=r"line 2, column 'class': 'cat' is no finite number"):
+    with pytest.raises(DataError, match=r"line 2, column 'class': 'cat' is not a finite number"):
         prepare_data(file, kind="real")
     with pytest.raises(DataError, match=r"data\.target = \['class', 'word'\] does not fit data\.kind=class"):
         prepare_data(file, target=["class", "word"])
@@ -306,7 +306,7 @@ def test_read_uses_the_training_rows_and_needs_no_prepare(tmp_path: Path) -> Non
     ):
         fresh.read([other])
     other.write_text("number,square\n3,9\n4,\n")
-    with pytest.raises(DataError, match=r"other\.csv line 3, column 'square': '' is no finite number"):
+    with pytest.raises(DataError, match=r"other\.csv line 3, column 'square': '' is not a finite number"):
         fresh.read([other])
 
 

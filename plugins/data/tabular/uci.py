@@ -1,4 +1,4 @@
-"""Regression sets of the UCI repository with the splits on which the literature compares itself."""
+"""Regression data sets of the UCI repository, with the splits on which published results are compared."""
 
 from dataclasses import replace
 from functools import cached_property

@@ -198,7 +198,8 @@ class BallisticHead(DensityHead, Fitted):
         if not finite.all():
             raise NonFiniteParameters(
                 f"The flight in batch row {int((~finite).nonzero()[0])} has no finite course with step={self.step:g} "
-                f"and {self.constants}. Set density_head.step and density_head.constants to those of the recordings."
+                f"and {self.constants}. Set density_head.step and density_head.constants to the values of "
+                "the recordings."
             )
 
     def _linearised(

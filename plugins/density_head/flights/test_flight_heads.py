@@ -85,5 +85,5 @@ def test_physics_far_from_any_ball_give_a_density_or_a_sentence(
 
 def test_a_window_of_another_length_than_the_head_reads_is_refused() -> None:
     head = BallisticHead(TWO_FRAMES, observed=7, constants=Constants())
-    with pytest.raises(ConfigError, match="BallisticHead reads 35 numbers per sample, but gets 30"):
+    with pytest.raises(ConfigError, match="BallisticHead reads 35 numbers per sample, but its input has 30"):
         Model([], head, (30,))

@@ -73,7 +73,7 @@ def test_the_quantile_agrees_with_40_digits_and_is_never_infinite():
     quantiles = normal_quantile(torch.tensor(places, dtype=torch.float64))
     with mpmath.workdps(40):
         for z, place in zip(quantiles.tolist(), places, strict=True):
-            # compared through Φ, relative to the smaller tail: rounding of a position near 1 is no error of z
+            # compared through Φ, relative to the smaller tail: rounding of a position near 1 is not an error of z
             tail, back = (
                 (mpmath.mpf(place), mpmath.ncdf(z))
                 if place <= 0.5

@@ -55,7 +55,7 @@ class PiecewiseQuantiles(Distribution):
 
     @property
     def quantiles(self) -> Float[Tensor, "*batch level"]:
-        """Quantiles of the probabilities, ascending."""
+        """Quantiles at the given probabilities, ascending."""
         return self.location + self.offsets
 
     @property

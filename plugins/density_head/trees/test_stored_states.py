@@ -1,4 +1,4 @@
-"""Tests that stored arrays that are no forest, and bytes that are no model, are refused before compiled code runs."""
+"""Tests that arrays that are not a forest, and bytes that are not a model, are refused before compiled code runs."""
 
 import struct
 

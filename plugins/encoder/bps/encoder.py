@@ -46,7 +46,7 @@ class BPS(Encoder):
         rotation_invariant: encode each cloud along its own axes (`plugins.encoder.bps.frame`).
 
     Raises:
-        ConfigError: the input is no cloud; a feature is named twice or needs a column that the clouds do not have; or
+        ConfigError: the input is not a cloud; a feature is named twice or needs a column that the clouds lack; or
             the basis is "grid" and `points` is not the cube of an integer.
     """
 

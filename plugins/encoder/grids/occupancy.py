@@ -26,7 +26,7 @@ class Occupancy(Encoder):
         normalise: as in `framework.geometry.clouds.normalise_clouds`. With "robust", far outliers lie in no cell.
 
     Raises:
-        ConfigError: the input is no cloud.
+        ConfigError: the input is not a cloud.
     """
 
     fixed = True

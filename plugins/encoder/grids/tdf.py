@@ -27,7 +27,7 @@ class TDF(Encoder):
         normalise: as in `framework.geometry.clouds.normalise_clouds`.
 
     Raises:
-        ConfigError: the input is no cloud.
+        ConfigError: the input is not a cloud.
     """
 
     fixed = True

@@ -53,7 +53,7 @@ class VoxNet(Encoder):
             same.
 
     Raises:
-        ConfigError: the input is no cubic grid, or is too small, or `dropout` has the wrong length.
+        ConfigError: the input is not a cubic grid, or is too small, or `dropout` has the wrong length.
     """
 
     bibtex = "maturana2015voxnet"

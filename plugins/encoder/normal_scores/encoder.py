@@ -49,7 +49,7 @@ class NormalScores(Encoder, FitsInputs):
         numbers = numbers.to(dtype)
         values, scores = self.values.to(numbers), self.scores.to(numbers)
         slopes = scores.diff() / torch.where(values.diff() > 0, values.diff(), 1.0)
-        if torch.compiler.is_exporting():  # a search in a sorted list is no operation of ONNX
+        if torch.compiler.is_exporting():  # a search in a sorted list is not an operation of ONNX
             inside = torch.minimum((numbers.unsqueeze(-1) - values[:, :-1]).clamp(min=0), values.diff())
             return torch.cat([numbers, scores[:, 0] + (inside * slopes).sum(-1)], 1)
         inside = numbers.T.clamp(values[:, :1], values[:, -1:]).contiguous()

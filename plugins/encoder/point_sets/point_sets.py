@@ -30,7 +30,7 @@ def count_columns(input_shape: tuple[int, ...], by: str, attributes: bool) -> in
         attributes: whether columns after x, y, z are read too.
 
     Raises:
-        ConfigError: the input is no cloud, or attributes are requested and the clouds have none.
+        ConfigError: the input is not a cloud, or attributes are requested and the clouds have none.
     """
     require_clouds(input_shape, by)
     if attributes and input_shape[1] == 3:
@@ -59,7 +59,7 @@ class CloudNetwork(Encoder):
     """Base class of networks on the points of clouds, which compute few clouds at a time where possible.
 
     Attributes:
-        reading: columns, points and normalisation that are read.
+        reading: which columns and points of a cloud are read, and how the points are normalised.
         rows_per_point: as in `encode_in_parts`.
     """
 

@@ -37,7 +37,7 @@ class PointNet(CloudNetwork):
         attributes: whether columns after x, y, z are read too; the first matrix does not change them.
 
     Raises:
-        ConfigError: the input is no cloud, or has no attributes to read.
+        ConfigError: the input is not a cloud, or has no attributes to read.
     """
 
     bibtex = "qi2017pointnet"

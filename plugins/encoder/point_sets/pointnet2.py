@@ -76,7 +76,7 @@ class PointNet2(CloudNetwork):
         attributes: whether columns after x, y, z are read too.
 
     Raises:
-        ConfigError: the input is no cloud, or has no attributes to read.
+        ConfigError: the input is not a cloud, or has no attributes to read.
     """
 
     bibtex = "qi2017pointnetplusplus"

@@ -24,7 +24,7 @@ class Points(Encoder):
         seed: seed of "random"; the run's seed has no influence on it.
 
     Raises:
-        ConfigError: the input is no cloud.
+        ConfigError: the input is not a cloud.
     """
 
     fixed = True

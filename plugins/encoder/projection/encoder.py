@@ -217,7 +217,7 @@ class Projection(Encoder):
             `splats.compute_surface`.
 
     Raises:
-        ConfigError: the input is no cloud of coloured points, or the range of depths is empty.
+        ConfigError: the input is not a cloud of coloured points, or the range of depths is empty.
     """
 
     fixed = True
@@ -255,7 +255,7 @@ class Projection(Encoder):
 
     def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
         """Return the images of the clouds."""
-        sizes(inputs)  # raises DataError for inputs that are no clouds
+        sizes(inputs)  # raises DataError for inputs that are not clouds
         points = project(inputs, self.view)
         if not self.splat:
             return points

@@ -86,7 +86,7 @@ class Rasterised(Encoder):
         picture, mesh: settings of the image and of the mesh.
 
     Raises:
-        ConfigError: the input is no cloud of coloured points, the renderer lacks a channel, `textures` is not
+        ConfigError: the input is not a cloud of coloured points, the renderer lacks a channel, `textures` is not
             `human_scans`, or the range of depths is empty.
         DataError: the mesh is not available; `forward` raises it if a texture is not available.
     """
@@ -137,7 +137,7 @@ class Rasterised(Encoder):
 
     @torch.no_grad()
     def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
-        sizes(inputs)  # raises DataError for inputs that are no clouds
+        sizes(inputs)  # raises DataError for inputs that are not clouds
         if len(inputs) and inputs.shape[1] <= int(self.faces.max()):
             raise DataError(
                 f"Got a mesh of {inputs.shape[1]} vertices, but the topology has {int(self.faces.max()) + 1} vertices. "

@@ -247,7 +247,7 @@ def require_images(
         least: smallest allowed number of channels of the input.
 
     Raises:
-        ConfigError: the input is no image, or has too few channels, or crop and normalisation exclude each other.
+        ConfigError: the input is not an image, or has too few channels, or crop and normalisation exclude each other.
     """
     if len(input_shape) != 3 or min(input_shape) < 1:
         raise ConfigError(

@@ -37,7 +37,7 @@ class Slim(Encoder):
         report: areas of the images of the last batch that evaluation computed; None after training, and without crop.
 
     Raises:
-        ConfigError: the input is no image, or `crop` with `normalisation="group"`.
+        ConfigError: the input is not an image, or `crop` with `normalisation="group"`.
     """
 
     bibtex = "shi2016realtime"

@@ -68,7 +68,7 @@ def test_nan_wrong_labels_and_wrong_densities_raise_a_clear_message():
         compute_metric(torch.tensor([[0.0, 1.0], [0.0, torch.nan]]), [0, 1])
     with pytest.raises(DataError, match="row 1 is 2, but class indices go from 0 to 1"):
         compute_metric(torch.zeros(2, 2), [0, 2])
-    with pytest.raises(UserError, match="is no density over classes"):
+    with pytest.raises(UserError, match="is not a density over classes"):
         real = Independent(Normal(torch.zeros(3, 1), 1.0), 1)
         Accuracy(classes(2)).update(Prediction(real, {"target": torch.zeros(3, dtype=torch.int64)}))
     with pytest.raises(ConfigError, match="metric accuracy describes targets of kind 'class'"):

@@ -44,7 +44,7 @@ class PredictionSet(Density):
             inside = self.contains(np.broadcast_to(labels, (count, *self.batch))).reshape(count, -1)
             return [np.flatnonzero(column).tolist() for column in inside.T]
         if self.event != (1,):
-            raise ValueError("Sets of several numbers cannot be listed. Ask `contains` for single values.")
+            raise ValueError("A set over several numbers cannot be listed. Use `contains` to test values.")
         return self._intervals()
 
     def _intervals(self) -> list[list[tuple[float, float]]]:

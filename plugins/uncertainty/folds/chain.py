@@ -82,7 +82,7 @@ class Chain(nn.Module):
         return numbers * (masks[0] if len(masks) == 1 else torch.cat(masks))
 
     def _mask(self, probability: float, numbers: Tensor) -> Tensor:
-        """Return factors of 0 and 1/(1 - p) in the shape of `numbers`."""
+        """Return random factors, 0 or 1/(1 - p) for the dropout probability p, in the shape of `numbers`."""
         count = numbers.numel()
         pool = self._pools.get(probability)
         if pool is None or len(pool) < count + POOL:

@@ -53,7 +53,7 @@ def wrapped(inner, samples=5):
 
 
 class Plain(Predictor):
-    """A predictor that is no framework Model."""
+    """A predictor that is not a framework Model."""
 
     def __init__(self, inner):
         super().__init__()

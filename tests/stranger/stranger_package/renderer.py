@@ -185,7 +185,7 @@ class RayCaster(Renderer):
         unknown = sorted(set(channels) - self.channels)
         if unknown:
             raise ValueError(
-                f"{unknown[0]!r} is no channel of ray_caster; it draws {', '.join(sorted(self.channels))}."
+                f"{unknown[0]!r} is not a channel of ray_caster; it draws {', '.join(sorted(self.channels))}."
             )
         count = len(scene.vertices)
         if scene.faces.numel() and not (scene.faces.min() >= 0 and scene.faces.max() < count):
