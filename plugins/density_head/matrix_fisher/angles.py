@@ -9,13 +9,15 @@ from torch import Tensor
 
 from framework.distributions.shapes import broadcast_shapes
 from framework.geometry import quaternions
+from framework.geometry.aligned_rotations import Frame, log_height
 from plugins.density_head.matrix_fisher import quadrature
-from plugins.density_head.matrix_fisher.functions import Frame, log_height
 
 CHUNK = 2**18
 """Number of points at which the density is evaluated at once; arrays of 2 MB stay in the processor's cache."""
 FEW = {32: 19.0, 48: 54.0, 96: 236.0, 192: 368.0}
-"""Numbers of nodes of a quadrature with fixed nodes, each with the largest λ₃ (functions.py) for which it suffices.
+"""Numbers of nodes of a quadrature with fixed nodes, each with the largest λ₃ for which it suffices.
+
+framework/geometry/aligned_rotations.py defines λ.
 
 As a function of a single angle a, the log-density is c - Σ λᵢqᵢ² = c' + κ cos(a - φ) with constants c, c', φ and with κ
 at most λ₃/2. For exp(κ cos) the trapezium rule with N nodes on the circle has the relative error 2 I_N(κ)/I₀(κ), which

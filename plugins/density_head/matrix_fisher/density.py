@@ -15,8 +15,9 @@ from framework.distributions.exported import Exported, exported
 from framework.distributions.panels import entropy_of_one
 from framework.distributions.protocol import estimate, exact_estimate, marginal, pick, take, tempered_density
 from framework.distributions.uniform import uniform
+from framework.geometry import aligned_rotations as functions
 from framework.geometry import quaternions
-from plugins.density_head.matrix_fisher import angles, functions, quadrature
+from plugins.density_head.matrix_fisher import angles, quadrature
 
 VOLUME = 8 * math.pi**2
 """Volume of all rotations in the coordinates azimuth a, elevation e and tilt t (CHART), ∫ cos e da de dt."""

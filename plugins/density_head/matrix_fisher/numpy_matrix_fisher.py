@@ -16,8 +16,8 @@ class MatrixFisher(Density):
     """Azimuth, elevation and tilt of a rotation R with density exp(tr(FᵀR)) / c(F).
 
     The density is with respect to azimuth, elevation and tilt in the chart with elevations from -π/2 to π/2. Medians
-    and intervals are computed from random draws. The mode is the likeliest rotation. `functions.py` beside this file
-    explains the formulas.
+    and intervals are computed from random draws. The mode is the likeliest rotation. The comments of
+    framework/geometry/aligned_rotations.py explain the formulas.
 
     Args:
         parameter: F, (*batch, 3, 3).

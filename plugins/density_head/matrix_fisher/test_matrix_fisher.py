@@ -10,10 +10,11 @@ from framework.configuration.schema import build, resolve
 from framework.distributions.density import Mixture, circular_grid
 from framework.distributions.protocol import marginal, median, pick
 from framework.errors import ConfigError
+from framework.geometry import aligned_rotations as functions
 from framework.geometry import quaternions
 from framework.geometry.rotation import viewpoint_rotation
 from framework.target import Target
-from plugins.density_head.matrix_fisher import angles, functions, quadrature
+from plugins.density_head.matrix_fisher import angles, quadrature
 from plugins.density_head.matrix_fisher.density import Angle, MatrixFisher
 from plugins.density_head.matrix_fisher.head import LARGEST_PARAMETER, parameter_of_raw
 from plugins.density_head.matrix_fisher.rows import TARGET, log_constant

@@ -237,7 +237,7 @@ def _quadrature(falls: Tensor) -> tuple[_Circle, _Circle, Tensor]:
     start = (1 + stretch * end).rsqrt()  # t₀ in units of √end
     length = torch.asinh(1 / start)
     border = (length - PANEL).clamp(min=0)
-    (early, early_weight), (late, late_weight) = (_legendre(count, falls.device) for count in NODES)
+    (early, early_weight), (late, late_weight) = (legendre(count, falls.device) for count in NODES)
     y = torch.cat([border * early, border + (length - border) * late], -1)
     weight = torch.cat([border * early_weight, (length - border) * late_weight], -1)
     root = start * torch.sinh(y)
@@ -249,7 +249,7 @@ def _quadrature(falls: Tensor) -> tuple[_Circle, _Circle, Tensor]:
     return outer, inner, weight * slope * torch.exp(-second * w) * bessels
 
 
-def _legendre(count: int, device: torch.device) -> tuple[Tensor, Tensor]:
+def legendre(count: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Return nodes and weights of Gauss-Legendre quadrature on [0, 1]."""
     nodes, weights = _legendre_numbers(count)
     return torch.tensor(nodes, device=device), torch.tensor(weights, device=device)
