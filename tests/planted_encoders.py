@@ -91,6 +91,14 @@ class Residual(Conv):
         return found + self.gain * self.branch(found).tanh()
 
 
+class Frozen(Conv):
+    """Convolutions that are never trained."""
+
+    def __init__(self, input_shape: tuple[int, ...]) -> None:
+        super().__init__(input_shape)
+        self.requires_grad_(False)
+
+
 class Squares(Encoder):
     """Features without parameters: the numbers and their squares."""
 
@@ -112,6 +120,7 @@ RIGHT: dict[str, tuple[type[Encoder], tuple[int, ...]]] = {
     "convolutions": (Conv, IMAGE),
     "grey": (Conv, (1, 9, 14)),
     "a small residual": (Residual, IMAGE),
+    "frozen convolutions": (Frozen, IMAGE),
     "squares": (Squares, VECTOR),
 }
 """Correct encoders and the shapes of their inputs."""

@@ -747,6 +747,10 @@ def silence_lightning() -> None:
         logging.getLogger(name).setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", message=".*LeafSpec", module="pytorch_lightning")
     warnings.filterwarnings("ignore", message=".*does not have many workers", module="pytorch_lightning")
+    # networks whose weights and batch norm are frozen stay in evaluation mode
+    warnings.filterwarnings(
+        "ignore", message=r"Found \d+ module\(s\) in eval mode", module="pytorch_lightning"
+    )
     # a cluster node that is used without SLURM
     warnings.filterwarnings("ignore", message="The `srun` command is available on your system")
     # the framework's data loader is resumable in a way that Lightning does not detect

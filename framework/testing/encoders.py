@@ -346,12 +346,12 @@ def _gradients(encoder: Encoder, batch: Tensor, worst: Worst) -> None:
 
     The batch is encoded several times, since dropout and inactive units may leave out a parameter by chance.
     """
-    worst.count(False, "the encoder has no parameters")
-    if not any(True for _ in encoder.parameters()):
+    worst.count(False, "no parameter of the encoder is trained")
+    missing = {name for name, parameter in encoder.named_parameters() if parameter.requires_grad}
+    if not missing:
         return
     encoder.train()
     encoder.zero_grad()  # other checks share the encoder
-    missing = {name for name, parameter in encoder.named_parameters() if parameter.requires_grad}
     for _ in range(4):
         encoder(batch).square().sum().backward()
         for name, parameter in encoder.named_parameters():

@@ -61,6 +61,7 @@ class COIL20(Data):
         self.image_size = image_size
         self.interpolate = interpolate
         self.jitter = jitter
+        self.varies = interpolate or jitter > 0
 
     def prepare(self) -> None:
         views = read_views(self.root, self.image_size)  # (object, view, 1, side, side)

@@ -44,6 +44,7 @@ class Caviar(Heads):
     ) -> None:
         self.source = Source(ARCHIVE, root, images, generator_seed)
         self.reading = reading
+        self.varies = reading.jitter > 0
 
     def read_labels(self, root: Path) -> Labels:
         labels = read_labels(root / LABELS)

@@ -47,6 +47,7 @@ class Idiap(Heads):
         # generated labels are always in radians; angles_in is for a user's own label file
         self.angles_in: Literal["radians", "degrees"] = "radians" if root is None else angles_in
         self.reading = reading
+        self.varies = reading.jitter > 0
         self.target = Target("angle", tuple(dict.fromkeys(angles or ANGLES)))
 
     def read_labels(self, root: Path) -> Labels:

@@ -47,6 +47,7 @@ class TownCentre(Heads):
     ) -> None:
         self.source = Source(ARCHIVE, root, images, generator_seed)
         self.reading = reading
+        self.varies = reading.jitter > 0 or mirror
         # The mirror image of a head at pan p shows a head at pan -p, which Beyer et al. write as 360° - p.
         self.signs = (-1.0,) if mirror else ()
 

@@ -107,6 +107,7 @@ class ImageFolder(LabelledData):
     ) -> None:
         super().__init__(root, labelled, jitter)
         self.mirror = mirror
+        self.varies = mirror or jitter > 0
         self.corruption: Corruption | None = corruption
         if corruption is None and strength is not None:
             raise ConfigError(

@@ -65,6 +65,7 @@ class ImagesWithAngles(Data):
         self.channels = 1 if grayscale else 3
         self.mirror = tuple(mirror or ())
         self.jitter = jitter
+        self.varies = bool(mirror) or jitter > 0
         self.skip_unreadable = skip_unreadable
         self.writing = writing
 

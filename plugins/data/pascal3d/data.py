@@ -142,6 +142,7 @@ class Pascal3D(Data):
         self.framing = framing
         self.skip_unreadable = skip_unreadable
         self.variation = variation
+        self.varies = variation.mirror or variation.jitter > 0
         self.drawing = drawing
         self.input_shape = (3, framing.image_size, framing.image_size)
         names = self.categories if len(self.categories) < 4 else (f"{len(self.categories)} classes",)
