@@ -21,6 +21,7 @@ from framework.errors import ConfigError
 from framework.target import Target
 from plugins.data.image_folder.corruption import Corrupted, Corruption
 from plugins.data.image_folder.labelled import LabelledImages, Loaded, find_folder
+from plugins.data.image_folder.policy import Policy, vary_images
 
 Jitter = Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)]
 
@@ -85,6 +86,8 @@ class ImageFolder(LabelledData):
         labelled: Settings of the images and their labels.
         mirror: Whether half of the training images are mirrored left to right.
         jitter: Largest share by which training images are shifted, scaled and made brighter or darker.
+        policy: Policy that also varies the training images, after mirror and jitter: one random operation
+            (TrivialAugment) or two (RandAugment) for each batch; None for none.
         corruption: Corruption of the test images: Gaussian noise, a Gaussian blur, less contrast, or JPEG compression;
             None for none.
         strength: Strength of the corruption, as in ImageNet-C; None: 3 if there is a corruption.
@@ -93,7 +96,9 @@ class ImageFolder(LabelledData):
         ConfigError: A strength is given without a corruption.
     """
 
-    bibtex = "image_folder, hendrycks2019benchmarking"
+    bibtex = (
+        "image_folder, hendrycks2019benchmarking, muller2021trivial, cubuk2020randaugment, riba2020kornia"
+    )
 
     def __init__(
         self,
@@ -102,12 +107,14 @@ class ImageFolder(LabelledData):
         labelled: LabelledImages,
         mirror: bool = False,
         jitter: Jitter = 0.08,
+        policy: Policy | None = None,
         corruption: Corruption | None = None,
         strength: Annotated[int, Field(ge=1, le=5)] | None = None,
     ) -> None:
         super().__init__(root, labelled, jitter)
         self.mirror = mirror
-        self.varies = mirror or jitter > 0
+        self.policy: Policy | None = policy
+        self.varies = mirror or jitter > 0 or policy is not None
         self.corruption: Corruption | None = corruption
         if corruption is None and strength is not None:
             raise ConfigError(
@@ -133,10 +140,13 @@ class ImageFolder(LabelledData):
             self.remarks += (f"test images are corrupted: {self.corruption}, strength {self.strength} of 5",)
 
     def augment(self, batch: Batch) -> Batch:
-        if not self.jitter and not self.mirror:
-            return batch
-        mirrored = (torch.rand(len(batch["input"])) < 0.5) & self.mirror
-        return {**batch, "input": images.augment(batch["input"], mirrored, self.jitter)}
+        varied = batch["input"]
+        if self.jitter or self.mirror:
+            mirrored = (torch.rand(len(varied)) < 0.5) & self.mirror
+            varied = images.augment(varied, mirrored, self.jitter)
+        if self.policy is not None:
+            varied = vary_images(varied, self.policy)
+        return {**batch, "input": varied}
 
     def fingerprint(self) -> Mapping[str, str]:
         corruption = "none" if self.corruption is None else f"{self.corruption} {self.strength}"

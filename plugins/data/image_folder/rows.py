@@ -44,7 +44,7 @@ def write_idx(folder: Path, count: int = 40, side: int = 9) -> Mapping[str, str]
 
 FOLDERS = DataRow(
     "folders",
-    {"image_size": 8, "mirror": True},
+    {"image_size": 8, "mirror": True, "policy": "random"},
     write=write_folders,
     synthetic=False,
     files=images,
@@ -63,7 +63,7 @@ TABLE = replace(
 IDX = replace(
     FOLDERS,
     name="idx files, corrupted",
-    config={"image_size": 9, "grayscale": True, "corruption": "noise", "strength": 2},
+    config={"image_size": 9, "grayscale": True, "policy": "trivial", "corruption": "noise", "strength": 2},
     write=write_idx,
     fragile={"train-images-idx3-ubyte.gz": DAMAGES, "train-labels-idx1-ubyte": DAMAGES},
     skip={},
