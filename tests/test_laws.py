@@ -195,6 +195,7 @@ NOT_IN_THE_THESIS = {
     "density_head/quantiles",
     "density_head/student_t",
     "encoder/normal_scores",
+    "encoder/resnet",
     "metric/coverage",
     "metric/crps",
     "metric/decision_cost",
