@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from framework.data import Batch
 from framework.geometry.camera import Camera
 
 Wrap = Literal["repeat", "clamp", "mirror"]
@@ -207,6 +208,9 @@ class Renderer(ABC):
     report: Report | None = None
     """Report on the last image; None if the renderer keeps none."""
 
+    parameters: int = 0
+    """Number of trained parameters; 0 for a renderer that learns nothing."""
+
     def batch(
         self, scenes: Sequence[Scene], channels: Collection[str] = ("color",)
     ) -> list[dict[str, Tensor]]:
@@ -223,4 +227,47 @@ class Renderer(ABC):
         Raises:
             ValueError: the renderer cannot draw a channel; or "color" is requested of a scene without colours; or
                 shapes or indices do not fit. The message says what the renderer got and what it requires.
+        """
+
+
+class TrainedRenderer(Renderer):
+    """Additional contract of a renderer that draws with the trained model of a run.
+
+    The keyword-only parameters of its constructor include these two:
+
+    - checkpoint: folder of the run, or its checkpoint file; None if there is no trained model yet. `mode=render` then
+      trains the model of its config first, and names its own run folder here.
+    - paths: files and folders that the run's config names, by dotted key. A stored path is opened only if it is
+      repeated here.
+    """
+
+
+class HasScenes(ABC):
+    """Additional base class of a data set whose test images show known scenes, which `mode=render` draws again.
+
+    The batches hold the true images in the fields "color", "mask" or "depth" (`framework.data.Batch`).
+    """
+
+    surfaces: ClassVar[tuple[str, ...]] = ("colors",)
+    """Kinds of surfaces that the scenes can have, the default first.
+
+    The names are "colors", for colours of vertices, and "textures".
+    """
+
+    ground: ClassVar[float] = 1.0
+    """Linear RGB value of the true images where no subject is seen: 0 for black, 1 for white."""
+
+    @abstractmethod
+    def scenes(self, batch: Batch, surface: str) -> list[Scene]:
+        """Return the scenes of a batch of the test split, on the CPU; works after `Data.prepare`.
+
+        Colours have four channels: red, green, blue, and 1 everywhere, whose render is the share of each pixel that the
+        surface covers.
+
+        Args:
+            batch: batch of the test split.
+            surface: one of `surfaces`.
+
+        Raises:
+            DataError: the surface of a scene cannot be read.
         """

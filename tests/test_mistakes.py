@@ -75,7 +75,7 @@ trainer.keep=beest | Did you mean 'best'?
 +trainer.accumulate_grad_batches=0 | trainer.accumulate_grad_batches = 0
 +trainer.deterministic=maybe | trainer.deterministic = 'maybe'
 +trainer.max_time=soon | trainer.max_time = 'soon'
-mode=check checkpoint=run | mode=check reads no checkpoint; train, test, calibrate, predict, export, work_precision do
+mode=check checkpoint=run | mode=check reads no checkpoint; train, test, calibrate, predict,
 experiment=moons/vanilla_128 checkpoint=outputs/run | outputs/run is neither a file, a folder nor an MLflow run id
 seed=-1 | seed = -1
 seed=one | seed = 'one'
@@ -184,21 +184,37 @@ renderer=opengl | 'renderer/opengl'. Available in renderer
 uncertainty=[ensembl] | Did you mean 'ensemble'?
 data=cifar10 | 'data/cifar10'. Available in data
 experiment=moons/vanilla_128 'encoder.mlp.widths=[0]' | encoder
-experiment=moons/vanilla_128 renderer=zbuffer | renderer=zbuffer: mode=train reads no renderer; check does
+experiment=moons/vanilla_128 renderer=zbuffer | renderer=zbuffer: mode=train reads no renderer; render, check do
 -m experiment=moons/vanilla_128 renderer=zbuffer,rasterizer | renderer=zbuffer: mode=train reads no renderer
-mode=test checkpoint=nowhere density_head=bernoulli | mode=test reads no density_head; train, check do
-mode=test checkpoint=nowhere encoder=[mlp] | mode=test reads no encoder; train, encode, check do
-mode=test checkpoint=nowhere trainer.max_epochs=3 | mode=test reads no trainer.max_epochs; train does
-mode=test checkpoint=nowhere optimizer=sgd | mode=test reads no optimizer; train does
+mode=test checkpoint=nowhere density_head=bernoulli | mode=test reads no density_head; train, render, check do
+mode=test checkpoint=nowhere encoder=[mlp] | mode=test reads no encoder; train, encode, render, check do
+mode=test checkpoint=nowhere trainer.max_epochs=3 | mode=test reads no trainer.max_epochs; train, render do
+mode=test checkpoint=nowhere optimizer=sgd | mode=test reads no optimizer; train, render do
 mode=test checkpoint=nowhere debug=fast | debug=fast has no effect
 mode=predict checkpoint=nowhere metric=[accuracy] | mode=predict reads no metric
 mode=predict checkpoint=nowhere pictures=false | mode=predict reads no pictures
 mode=predict checkpoint=nowhere metric.x.y=1 | metric.x.y=1: mode=predict reads no metric
-mode=calibrate checkpoint=nowhere objective=[adversarial] | mode=calibrate reads no objective; train, check do
+mode=calibrate checkpoint=nowhere objective=[adversarial] | mode=calibrate reads no objective; train, render, check do
 mode=combine mode.members=nowhere checkpoint=nowhere | mode=combine reads no checkpoint
 mode=encode mode.files=a mode.into=b data=point_cloud_folder samples=3 | mode=encode reads no samples
 mode=plugins data=moons | mode=plugins reads no data
 mode=sync mode.run=nowhere data=moons | mode=sync reads no data
+mode=render mode.files=a.obj | mode=render needs a renderer. Choose an installed one: renderer=
+mode=render renderer=rasterizer | has no scenes to draw. Set mode.files
+mode=render renderer=rasterizer mode.files=nowhere.obj | the file does not exist
+mode=render renderer=rasterizer mode.files=a.obj mode.surface=colors | only the scenes of a data set have this option
+mode=render renderer=rasterizer mode.files=a.obj mode.camera=b.json mode.fov=3 | mode.camera says the whole view
+mode=render renderer=rasterizer mode.files=a.obj checkpoint=nowhere | renderer=rasterizer has no trained model
+mode=render renderer=rasterizer mode.files=a.obj optimizer=adam | renderer=rasterizer learns nothing
+mode=render renderer=rasterizer mode.files=a.obj metric=[psnr] | mode.truth names no true images
+mode=render renderer=rasterizer mode.files=a.obj data=human_scans | mode.files is set
+mode=render renderer=rasterizer mode.files=a.obj mode.background=whit | mode.background = 'whit'
+mode=render renderer=rasterizer mode.files=a.obj mode.channels=[colour] | Did you mean 'color'?
+mode=render renderer=rasterizer data=moons | data=moons has no scenes to draw
+mode=render renderer=rasterizer data=human_scans mode.frames=3 | only scenes of mode.files have this option
+mode=render renderer=smplpix mode.files=a.obj | renderer=smplpix draws with a trained model. Add checkpoint=
+mode=render renderer=smplpix mode.files=a.obj checkpoint=nowhere | Give the folder that a run printed at its start
+mode=render renderer=smplpix data=human_scans mode.surface=texture | draws with a trained model
 mode=check data=moons samples=3 | mode=check reads no samples
 +mode.files=a experiment=moons/vanilla_128 | mode.files: unknown key
 experiment=moons/vanilla_128 optimizer.patience=3 | only the schedule plateau reads it

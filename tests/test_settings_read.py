@@ -42,6 +42,7 @@ from framework.errors import ConfigError
 from framework.runs.session import Session, note_idle_samples
 from framework.storage.progress import output
 from framework.target import Target
+from framework.testing.bodies import write_subjects
 from framework.training.schedules import Plateau, make_schedule
 
 GROUPED = {"optimizer": OptimizerSettings, "logger": LoggerSettings, "trainer": TrainerSettings}
@@ -116,6 +117,11 @@ COMMANDS: dict[str, Sequence[str]] = {
     "encode": ("data=point_cloud_folder", "encoder=[bps]", "mode.files={clouds}", "mode.into={features}"),
     "export": ("checkpoint={train}",),
     "work_precision": ("checkpoint={combine}", "mode.metrics=[nll]", "mode.repeats=2"),
+    "render": (
+        *("renderer=smplpix", "data=human_scans", "data.root={people}", "metric=[psnr]", "batch_size=4"),
+        *("encoder=[projection,slim]", "encoder.projection.height=12", "encoder.projection.width=9"),
+        *("encoder.slim.widths=[4,4]", "density_head=laplace_image", "trainer.max_epochs=1", "samples=1"),
+    ),
     "check": ("data=moons",),
     "plugins": (),
     "new": ("mode.plugin=density_head/my_head", "mode.folder={new}"),
@@ -133,7 +139,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def composed(folder: Path) -> Iterator[Callable[[str], Config]]:
     """The config of a mode's command."""
-    places = {name: str(folder / name) for name in (*MODES, "clouds", "features")}
+    places = {name: str(folder / name) for name in (*MODES, "clouds", "features", "people")}
 
     def config(mode: str) -> Config:
         overrides = [f"mode={mode}", *QUIET, *(one.format(**places) for one in COMMANDS[mode])]
@@ -152,6 +158,8 @@ def test_a_mode_reads_what_it_says_it_reads(
 ) -> None:
     (folder / "clouds").mkdir(exist_ok=True)
     np.savetxt(folder / "clouds" / "one.xyz", np.random.default_rng(0).normal(size=(50, 3)))
+    if mode == "render":
+        write_subjects(folder / "people")
     config = composed(mode)
     require_read(mode, config.overrides)
     seen: set[str] = set()

@@ -57,6 +57,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "checkpoint=train mode.values=[1,2] mode.repeats=2",
         "torchmetrics matplotlib numba scipy.linalg",  # its reference takes so many samples that they are compiled
     ),
+    "render": ("renderer=rasterizer mode.files=clouds/scene.obj pictures=false", "numba scipy.linalg"),
     "check": ("metric=[accuracy]", "torchmetrics"),
     "plugins": ("", ""),
     "new": ("mode.plugin=density_head/my_head", ""),
@@ -98,6 +99,7 @@ def started(once: Once, stranger_site: Path) -> Path:
     def run(folder: Path) -> None:
         (folder / "clouds").mkdir()
         np.save(folder / "clouds" / "a.npy", np.random.default_rng(0).random((50, 3), np.float32))
+        (folder / "clouds" / "scene.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
         own = {mode: ["logger=none", "threads=1", f"hydra.run.dir={mode}"] for mode in COMMANDS}
         lines = [
             json.dumps([mode, [f"mode={mode}", *settings.split(), *own[mode]]])

@@ -29,13 +29,13 @@ class Mode:
     stored: tuple[str, ...] = ()
 
 
+_TRAIN = (
+    *(*_RUN, *_TEST, *BUNDLES, "checkpoint", "data", "outliers", "encoder", "density_head"),
+    *("uncertainty", "objective", "metric", "optimizer", "trainer"),
+)
+
 MODES: Mapping[str, Mode] = {
-    "train": Mode(
-        (
-            *(*_RUN, *_TEST, *BUNDLES, "checkpoint", "data", "outliers", "encoder", "density_head"),
-            *("uncertainty", "objective", "metric", "optimizer", "trainer"),
-        )
-    ),
+    "train": Mode(_TRAIN),
     "test": Mode((*_STORED, "checkpoint", "outliers"), ("data", "outliers", "metric", *MODEL)),
     "calibrate": Mode(
         (*_STORED, "checkpoint", "outliers", "uncertainty"), ("data", "outliers", "metric", *MODEL)
@@ -47,6 +47,7 @@ MODES: Mapping[str, Mode] = {
     "encode": Mode((*_RUN, *BUNDLES, "batch_size", "workers", "data", "encoder")),
     "export": Mode((*BUNDLES, "checkpoint", "budget"), ("data", *MODEL)),
     "work_precision": Mode((*_STORED, "checkpoint"), ("data", "metric", *MODEL)),
+    "render": Mode((*_TRAIN, "renderer")),
     "check": Mode((*BUNDLES, *GROUPS)),
     "plugins": Mode(),
     "new": Mode(),

@@ -27,7 +27,7 @@ from framework.storage.path_marks import Words as Words
 
 SINGLE = ("data", "outliers", "density_head", "renderer")
 """Groups from which a config chooses one plugin; from each other group, a config may choose several."""
-OPTIONS = ("files", "into", "members", "run")
+OPTIONS = ("files", "into", "members", "run", "truth", "camera")
 """Options of modes that name files, folders or runs."""
 UNUSED = ("metric", "objective", "outliers", "renderer")
 """Groups whose plugins are not imported to load a model.

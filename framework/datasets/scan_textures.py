@@ -15,6 +15,12 @@ from framework.geometry.srgb import linear_from_bytes
 from framework.renderer import Texture
 from framework.storage.reading import read_bytes
 
+TEXELS = 4
+"""Largest number of texels along a side of a texture for each pixel of the image's longer side.
+
+Finer textures are averaged. For the default body some 6 × 6 texels then lie in a pixel, so that with `supersampling` 4
+the samples skip no texel.
+"""
 CACHED = 16
 """Number of textures that stay in memory: together 67 MB for textures of 512 × 512 texels."""
 

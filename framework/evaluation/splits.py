@@ -75,8 +75,8 @@ def evaluate(
     """
     predictor.eval().to(device)
     several = len(groups) > 1
-    by_group = {name: _fresh(metrics, device) for name in groups} if several else {}
-    overall = _fresh(metrics, device)
+    by_group = {name: fresh(metrics, device) for name in groups} if several else {}
+    overall = fresh(metrics, device)
     for number, batch in enumerate(on_device(batches, device)):
         _update(overall, predictor, batch, samples, Draw(seed, number))
         for index, name in enumerate(groups if several else ()):
@@ -90,7 +90,7 @@ def evaluate(
     return Evaluation(numbers(overall), {name: numbers(group) for name, group in by_group.items()}, overall)
 
 
-def _fresh(metrics: "Sequence[Metric]", device: torch.device) -> "list[Metric]":
+def fresh(metrics: "Sequence[Metric]", device: torch.device) -> "list[Metric]":
     """Return copies of the metrics on a device."""
     return [cast("Metric", metric.clone().to(device)) for metric in metrics]
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,6 @@ from framework.configuration.paths import shell_arguments
 from framework.errors import UserError
 from framework.evaluation.cost import Cost
 from framework.evaluation.splits import Evaluation, cost, evaluate
-from framework.metric import HasFigure
 from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, machine, results_table
 from framework.runs.provenance import package_versions
 from framework.runs.run import Run
@@ -52,19 +52,9 @@ def report_test(run: Run, session: Session) -> None:
     columns = {key: heading for metric in metrics for key, heading in metric.columns.items()}
     better: Better = {**{key: way for metric in metrics for key, way in metric.better.items()}, **COST_BETTER}
     synthetic = data.synthetic or (outliers is not None and outliers.synthetic)
-    results = _results(run, session, evaluation, run_cost, columns, better)
+    results = results_of(run, session.method, session.data_title, evaluation, run_cost, columns, better)
     results |= {"synthetic": synthetic, "test_samples": len(loader.dataset)}  # type: ignore[arg-type]
-    path = run.folder / "results.json"
-    write_whole(path, json.dumps(results, indent=1).encode())
-    numbers = {key: float(value) for key, value in asdict(run_cost).items() if isinstance(value, int | float)}
-    groups = {f"test/{name}": values for name, values in evaluation.groups.items()}
-    already_logged = _logged_names(run)
-    for part, values in {"test": evaluation.total, **groups, "cost": numbers}.items():
-        named = {f"{part}/{key}": value for key, value in values.items()}
-        run.tracker.log_metrics(
-            {name: value for name, value in named.items() if name not in already_logged}, 0, 0
-        )
-    run.tracker.log_artifact(path)
+    record_results(run, results, evaluation, run_cost)
     rows = [  # no bold numbers, because the groups of test samples do not compete
         results,
         *({**results, **numbers, "method": f"  {name}"} for name, numbers in evaluation.groups.items()),
@@ -97,14 +87,39 @@ def _save_pictures(run: Run, session: Session, evaluation: Evaluation, synthetic
             save_picture(run, figure, name)
     except UserError as error:
         session.console.print(f"No figure of predictions was drawn: {error}", soft_wrap=True, highlight=False)
+    save_metric_figures(run, evaluation, session.title, synthetic=synthetic)
+
+
+def save_metric_figures(run: Run, evaluation: Evaluation, title: str, *, synthetic: bool) -> None:
+    """Save the figures of the metrics that have one."""
+    if not evaluation.metrics:  # frames without true images need no metric, and so no torchmetrics
+        return
+    from framework.metric import HasFigure
+
     for metric in evaluation.metrics:
         if isinstance(metric, HasFigure):
-            save_picture(run, metric.figure(session.title, synthetic=synthetic), metric.figure_name)
+            save_picture(run, metric.figure(title, synthetic=synthetic), metric.figure_name)
 
 
-def _results(
+def record_results(run: Run, results: dict[str, Any], evaluation: Evaluation, run_cost: Cost) -> None:
+    """Write results.json, and log its numbers and the file to the store."""
+    path = run.folder / "results.json"
+    write_whole(path, json.dumps(results, indent=1).encode())
+    numbers = {key: float(value) for key, value in asdict(run_cost).items() if isinstance(value, int | float)}
+    groups = {f"test/{name}": values for name, values in evaluation.groups.items()}
+    already_logged = _logged_names(run)
+    for part, values in {"test": evaluation.total, **groups, "cost": numbers}.items():
+        named = {f"{part}/{key}": value for key, value in values.items()}
+        run.tracker.log_metrics(
+            {name: value for name, value in named.items() if name not in already_logged}, 0, 0
+        )
+    run.tracker.log_artifact(path)
+
+
+def results_of(
     run: Run,
-    session: Session,
+    method: str,
+    data: str,
     evaluation: Evaluation,
     run_cost: Cost,
     columns: dict[str, str],
@@ -112,9 +127,9 @@ def _results(
 ) -> dict[str, Any]:
     """Return the content of results.json."""
     return {
-        "method": session.method,
+        "method": method,
         "experiment": run.settings.experiment_name,
-        "data": session.data_title,
+        "data": data,
         "seed": run.settings.seed,
         **{key: _plain(value) for key, value in evaluation.total.items()},
         "groups": {
@@ -182,18 +197,43 @@ def _next_steps(run: Run, run_cost: Cost, console: Console) -> None:
     existing = [name for name in files if (run.folder / name).exists()]
     # A run that tests the model of another run has no model of its own.
     model = run.folder if files[-1] in existing else run.settings.checkpoint
+    commands = [
+        f"python -m framework mode=predict {_argument('checkpoint', model)} mode.files=<your files>",
+        report_command(run),
+        "and mode=calibrate, mode=export, sweeps: docs/commands.md",
+    ]
+    steps = [f"in a notebook: framework.load('{model}')"]
+    print_last_lines(run, run_cost, existing, steps, commands, console)
+
+
+def print_last_lines(
+    run: Run,
+    run_cost: Cost,
+    files: Sequence[str],
+    steps: Sequence[str],
+    commands: Sequence[str],
+    console: Console,
+    unit: str = "sample",
+) -> None:
+    """Print the machine, the run folder and its files, the lines `steps`, and the next commands.
+
+    `unit` is what `run_cost` counts.
+    """
     lines = [
         f"measured on {machine(run_cost.device, run_cost.threads)}, batches of {run_cost.batch_size}; "
-        f"a single sample takes {run_cost.latency_milliseconds:.2f} ms",
-        f"run folder:    {run.folder}   ({', '.join(existing)})",
+        f"a single {unit} takes {run_cost.latency_milliseconds:.2f} ms",
+        f"run folder:    {run.folder}   ({', '.join(files)})",
         f"all runs:      {run.tracker.url}",
-        f"in a notebook: framework.load('{model}')",
+        *steps,
         f"what to cite:  {run.folder / 'citations.bib'}",
-        f"next commands: python -m framework mode=predict {_argument('checkpoint', model)} mode.files=<your files>",
-        f"               python -m framework mode=report {_argument('mode.run', run.folder)}",
-        "               and mode=calibrate, mode=export, sweeps: docs/commands.md",
+        *(f"{'' if number else 'next commands:':15}{command}" for number, command in enumerate(commands)),
     ]
     console.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
+
+
+def report_command(run: Run) -> str:
+    """Return the command that writes a report on a run."""
+    return f"python -m framework mode=report {_argument('mode.run', run.folder)}"
 
 
 def _argument(key: str, path: Path | str | None) -> str:

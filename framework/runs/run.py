@@ -33,6 +33,7 @@ LEFT_BY_RUNS = (
     "overrides.yaml",
     "checkpoints",
     "figures",
+    "images",
     "results.json",
     "citations.bib",
     "params.json",

@@ -59,7 +59,10 @@ def compare(runs: Sequence[Mapping[str, Any]], overrides: Sequence[Sequence[str]
     runs = [{**dict.fromkeys(varied), **run} for run in runs]
     shown = (key for key in varied if key not in ("seed", "experiment") and not _repeats_data(runs, key))
     by = ["method", "data", *shown]
-    columns = {key: key.rpartition(".")[2] for key in by} | runs[0]["columns"] | COST_COLUMNS
+    own = runs[0]["columns"]  # headings of costs among them replace the usual ones, in the usual place
+    metrics = {key: heading for key, heading in own.items() if key not in COST_COLUMNS}
+    costs = {key: own.get(key, heading) for key, heading in COST_COLUMNS.items()}
+    columns = {key: key.rpartition(".")[2] for key in by} | metrics | costs
     # Columns without any number are left out.
     columns = {
         key: heading for key, heading in columns.items() if any(run.get(key) is not None for run in runs)
@@ -69,7 +72,7 @@ def compare(runs: Sequence[Mapping[str, Any]], overrides: Sequence[Sequence[str]
 
 def headline(compared: Comparison) -> str | None:
     """Return the key of the first number with a known direction that is not a cost and that all rows have."""
-    keys = (key for key in compared.runs[0]["columns"] if key in compared.better)
+    keys = (key for key in compared.runs[0]["columns"] if key in compared.better and key not in COST_COLUMNS)
     return next((key for key in keys if all(key in row for row in compared.rows)), None)
 
 

@@ -18,13 +18,14 @@ from framework.data import Batch, Data, Splits
 from framework.datasets import scan_layout
 from framework.datasets.fields import Fields
 from framework.datasets.scan_layout import Subject, SubjectFolder, View
+from framework.datasets.scan_textures import TEXELS, Textures
 from framework.errors import ConfigError, DataError, shorten
 from framework.geometry import clouds
 from framework.geometry.camera import Camera, canonical_camera
 from framework.geometry.mesh_files import COLOURS, XYZ
 from framework.geometry.meshes import READERS, read
-from framework.geometry.srgb import linear_from_bytes, srgb_from_linear
-from framework.renderer import Renderer
+from framework.geometry.srgb import linear_from_bytes, linear_from_srgb, srgb_from_linear
+from framework.renderer import HasScenes, Renderer, Scene
 from framework.storage.generated import read_mark
 from framework.storage.limits import MOST_INPUT
 from framework.target import Target
@@ -61,7 +62,7 @@ class Variation:
     recoloured: Annotated[float, Field(ge=0, le=1)] = 0.5
 
 
-class HumanScans(Data, SubjectFolder):
+class HumanScans(Data, SubjectFolder, HasScenes):
     """Photographs of people, each with the mesh registered to the person's scan (thesis §7.3.1, §7.4.1).
 
     An input is (points, 6): each vertex in the axes of the canonical camera of the image
@@ -88,6 +89,7 @@ class HumanScans(Data, SubjectFolder):
     bibtex = "prokudin2021smplpix, bregier2026anny"
     suffixes = tuple(READERS)
     columns = (*XYZ, *COLOURS)
+    surfaces = ("colors", "textures")
 
     def __init__(
         self,
@@ -141,6 +143,7 @@ class HumanScans(Data, SubjectFolder):
         else:
             root = self.place
         self.folder = root
+        self._textures: Textures | None = None
         self.groups = ("people",)
         self.synthetic = read_mark(root) is not None
         self.skipped = 0
@@ -159,6 +162,22 @@ class HumanScans(Data, SubjectFolder):
 
     def splits(self) -> Splits:
         return self._splits
+
+    def scenes(self, batch: Batch, surface: str) -> list[Scene]:
+        people, camera = self._splits.test.subjects, canonical_camera(*self.size)  # type: ignore[attr-defined]
+        scenes = []
+        for row, (cloud, number) in enumerate(zip(batch["input"], batch["subject"].tolist(), strict=True)):
+            vertices, colors = cloud[:, :3], cloud[:, 3:6]
+            faces = people[number].mesh.faces.int()
+            if surface == "textures":
+                if self._textures is None:
+                    longest = TEXELS * max(self.size)
+                    self._textures = Textures(self.folder, self.topology, faces, longest)
+                scenes.append(Scene(vertices, faces, None, camera, self._textures.look_up(colors, row)))
+            else:
+                paint = torch.cat([linear_from_srgb(colors), colors.new_ones(len(colors), 1)], 1)
+                scenes.append(Scene(vertices, faces, paint, camera))
+        return scenes
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         """Return one sample for each coloured mesh and each of its cameras.

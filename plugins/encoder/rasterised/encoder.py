@@ -15,7 +15,7 @@ from framework.configuration.paths import FilePath
 from framework.data import Data
 from framework.datasets import scan_layout
 from framework.datasets.scan_layout import SubjectFolder
-from framework.datasets.scan_textures import Textures
+from framework.datasets.scan_textures import TEXELS, Textures
 from framework.encoder import Encoder
 from framework.errors import ConfigError, DataError
 from framework.geometry.camera import canonical_camera
@@ -26,12 +26,6 @@ from framework.renderer import Renderer, Scene
 
 COLUMNS = (*XYZ, *COLOURS)
 Metres = Annotated[float, Field(gt=0, le=1e6)]
-TEXELS = 4
-"""Largest number of texels along a side of a texture for each pixel of the image's longer side.
-
-Finer textures are averaged. For the default body some 6 × 6 texels then lie in a pixel, so that with `supersampling` 4
-the samples skip no texel.
-"""
 
 
 @dataclass(frozen=True, kw_only=True)

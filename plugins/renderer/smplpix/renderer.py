@@ -16,7 +16,7 @@ from framework.errors import CheckpointError, ConfigError, DataError
 from framework.geometry.mesh_files import COLOURS, XYZ
 from framework.geometry.srgb import srgb_from_linear
 from framework.model import Predictor
-from framework.renderer import Renderer, Scene
+from framework.renderer import Scene, TrainedRenderer
 
 COLUMNS = (*XYZ, *COLOURS)
 """First columns of the points on which the network must have been trained."""
@@ -26,7 +26,7 @@ LARGEST_CHANGE, MEAN_CHANGE = 4 / 255, 0.05 / 255
 """Largest and mean difference between sRGB colours by bfloat16 and by float32 that `precision="auto"` accepts."""
 
 
-class SMPLpix(Renderer):
+class SMPLpix(TrainedRenderer):
     """Renderer that draws a scene with the trained network of a run of `smplpix/quick` or a similar experiment.
 
     Any pinhole camera is possible: vertices are transformed to the canonical camera of the image size, in which they
@@ -90,7 +90,8 @@ class SMPLpix(Renderer):
             if not (change.max() <= LARGEST_CHANGE and change.mean() <= MEAN_CHANGE):
                 precision = "float32"
         self._set_precision(precision)
-        self._predictor(*self.size)
+        network = self._predictor(*self.size)
+        self.parameters = sum(parameter.numel() for parameter in network.parameters())
 
     @torch.no_grad()
     def __call__(self, scene: Scene, channels: Collection[str] = ("color",)) -> dict[str, Tensor]:
