@@ -29,8 +29,41 @@ def command_line(arguments: list[str]) -> list[str]:
     _refuse_code_and_passwords(arguments)
     arguments = _put_flags_first(arguments)
     require_harmless(arguments, groups())
-    arguments = _name_newest_run(_use_resumed_folder(as_stored(arguments)))
+    arguments = _name_newest_run(_use_resumed_folder(as_stored(_list_loggers(arguments))))
     return _sweep_single_values(_choose_preset(arguments))
+
+
+def _list_loggers(arguments: list[str]) -> list[str]:
+    """Replace `logger=[mlflow,csv]` by the store, `logger=mlflow`, and the further forms, `logger.copies=[csv]`.
+
+    Raises:
+        ConfigError: There is no such logger, or `none` stands beside another one.
+    """
+    chosen: list[str] = []
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if key != "logger" or not value.startswith("["):
+            chosen.append(argument)
+            continue
+        names = [name.strip() for name in value.strip("[]").split(",") if name.strip()]
+        known = options("logger")
+        for name in names:
+            if name not in known:
+                raise ConfigError(
+                    f"{argument}: there is no logger {name!r}.{did_you_mean(name, known)} The loggers are "
+                    f"{', '.join(known)}."
+                )
+        if not names or ("none" in names and len(names) > 1):
+            raise ConfigError(
+                f"{argument}: give the names of one or more loggers, or logger=none. The loggers are "
+                f"{', '.join(known)}."
+            )
+        copies = [name for name in names if name not in ("mlflow", "none")]
+        chosen += [
+            f"logger={'mlflow' if 'mlflow' in names else 'none'}",
+            *([f"logger.copies=[{','.join(copies)}]"] if copies else []),
+        ]
+    return chosen
 
 
 def _name_newest_run(arguments: list[str]) -> list[str]:

@@ -49,9 +49,14 @@ class Config:
         """Return the config of a command after checking the settings that belong to no plugin.
 
         Raises:
-            ConfigError: A key is unknown, or a value is out of range.
+            ConfigError: A key is unknown, a value is out of range, or a package of a logger is missing.
         """
-        return cls(Settings.of(values), folder, overrides)
+        settings = Settings.of(values)
+        if settings.logger.copies:
+            from framework.tracking.copies import require_packages
+
+            require_packages(settings.logger.copies)
+        return cls(settings, folder, overrides)
 
     @cached_property
     def assembly(self) -> "Assembly":

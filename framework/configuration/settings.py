@@ -115,6 +115,8 @@ class LoggerSettings(_Strict):
     None means the environment variable MLFLOW_TRACKING_URI or, if it is not set, mlflow.db in the outputs folder.
     """
     experiment: str | None = None
+    copies: list[Literal["csv", "tensorboard", "wandb"]] = []
+    """Further forms in which the numbers are written into the run folder."""
 
 
 class BudgetSettings(_Strict):

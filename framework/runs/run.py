@@ -41,6 +41,9 @@ LEFT_BY_RUNS = (
     "work_precision.csv",
     TRACEBACK,
     "unreadable.txt",
+    "metrics.csv",
+    "tensorboard",
+    "wandb",
 )
 """Files and folders that modes write into a run folder; the tracker writes the journal in addition."""
 
@@ -143,22 +146,26 @@ def _begin_folder(config: Config) -> None:
 
 
 def _tracker(config: Config, run_id: str | None, resumed: bool) -> Tracker:
-    if config.settings.logger.name == "none":
-        return NoTracker(config.folder, resumed=resumed)
-    parent = os.environ.get(PARENT)
+    logger = config.settings.logger
     name = run_name(config.settings, _method(config) or config.mode, config.overrides)
-    return MlflowTracker(
-        config.folder,
-        Destination(
-            config.settings.logger.uri,
-            store_experiment(config.settings.plain(), config.trained_on),
-            name,
-            parent,
-            run_id,
-        ),
-        resumed=resumed,
-        wait=0.0 if parent is None else SYNCED_WITHIN,
-    )
+    experiment = store_experiment(config.settings.plain(), config.trained_on)
+    tracker: Tracker
+    if logger.name == "none":
+        tracker = NoTracker(config.folder, resumed=resumed)
+    else:
+        parent = os.environ.get(PARENT)
+        tracker = MlflowTracker(
+            config.folder,
+            Destination(logger.uri, experiment, name, parent, run_id),
+            resumed=resumed,
+            wait=0.0 if parent is None else SYNCED_WITHIN,
+        )
+    if not logger.copies:
+        return tracker
+    from framework.tracking.copies import COPIES, CopyingTracker
+
+    copies = [COPIES[form](config.folder, name, experiment) for form in dict.fromkeys(logger.copies)]
+    return CopyingTracker(tracker, copies)
 
 
 def _method(config: Config) -> str | None:
