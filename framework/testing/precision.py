@@ -48,7 +48,7 @@ def precision(subject: HeadSubject, worst: Worst) -> None:
     The error is relative to max(1, |log p|) plus the change of log p from rounding the raw parameters and angles. So a
     large error comes from cancellation inside the head. For a head with parameters of its own, the change from rounding
     them is added where the error is large. Where log p jumps, as at the border of a step, the result may also be that
-    on the other side, a few float32 epsilons away.
+    on the other side, a few float32 epsilons of the value and of the raw parameters away.
     """
     single = subject.make()
     double = copy.deepcopy(single).double()
@@ -73,8 +73,12 @@ def precision(subject: HeadSubject, worst: Worst) -> None:
                 scale = exact.abs().clamp(min=1) + change
                 error = (log_prob - exact).abs() / scale / torch.finfo(torch.float32).eps
             if (error > LIMIT).any() and value.is_floating_point():
-                for step in (-JUMP, JUMP):
-                    moved = value.double() * (1 + step * torch.finfo(torch.float32).eps)
+                # the place of a jump is a sum of numbers of the size of the raw parameters, in the target's unit
+                largest = raw.double().abs().flatten(1).amax(1).view(-1, *[1] * (value.dim() - 1))
+                unit = torch.tensor(subject.row.target.scale or 1.0, dtype=torch.float64)
+                place = torch.maximum(value.double().abs(), largest * unit)
+                for step in (sign * JUMP / 2**halving for halving in range(8) for sign in (-1, 1)):
+                    moved = value.double() + step * torch.finfo(torch.float32).eps * place
                     with torch.no_grad():
                         beyond = seeded(double, raw.double()).log_prob(moved)
                     gap = (log_prob - beyond).abs() / scale / torch.finfo(torch.float32).eps
