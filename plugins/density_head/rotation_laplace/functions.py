@@ -2,8 +2,7 @@
 
 A = U S Vᵀ is the proper singular value decomposition. With the aligned quaternion q of UᵀRV and the falls λ of
 `framework.geometry.aligned_rotations`, tr(S - AᵀR) = u = Σ λᵢqᵢ². The density of the paper has δ = 0 and is infinite at
-the mode. With δ = SOFTENING, the density is finite, and differs from that of the paper only for u
-of the order of δ².
+the mode. With δ = SOFTENING, the density is finite, and differs from the paper's density only for u of the order of δ².
 
 **The normaliser.** For d > 0 (Gradshteyn & Ryzhik 2007, 3.471.15)
 
@@ -11,8 +10,8 @@ of the order of δ².
 
 so that a rotation Laplace density is a mixture of the densities exp(-s Σ λᵢqᵢ²) / k(sλ) over s, and k is a single
 integral. With s = exp(τ), the integrand is analytic around the real line, and the error of the trapezium rule in τ
-falls exponentially with 1/h for the step h (Trefethen & Weideman 2014, Thm. 5.1). The tests find errors of log F below 1e-8.
-Draws choose a node by its weight, and then an aligned quaternion with the falls sλ.
+falls exponentially with 1/h for the step h (Trefethen & Weideman 2014, Thm. 5.1). The tests find errors of log F below
+1e-8. Draws choose a node by its weight, and then an aligned quaternion with the falls sλ.
 """
 
 import math
