@@ -194,8 +194,8 @@ def section(name: str, runs: Mapping[str, list[Trial]]) -> list[str]:
     return [
         *lines,
         "",
-        f"A grid dominates a front if it beats every point of it. This happened in {dominated} of "
-        f"{len(searches) * len(grids)} comparisons. In the other direction, a search beats on average "
+        "A grid dominates the front of a search if the points of the grid beat every point of this front. This "
+        f"happened in {dominated} of {len(searches) * len(grids)} comparisons. Conversely, a search beats on average "
         + " and ".join(f"{count} points on the front of the {grid}" for count, grid in zip(against, grids, strict=True))
         + ".",
         "",

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 SEED = 40
-"""Seed of the noise."""
+"""Seed of the noise from which weights are drawn."""
 
 
 def weight_noise(draw: int, size: int) -> Float[Tensor, "size"]:

@@ -152,7 +152,7 @@ class BudgetSettings(_Strict):
 
     @property
     def limits(self) -> bool:
-        """Return true if there is a limit."""
+        """Return whether the run time or the error is limited."""
         return self.milliseconds is not None or self.error is not None
 
 

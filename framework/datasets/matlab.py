@@ -24,9 +24,9 @@ NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8
 LETTERS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
 """Encodings of text elements, by element type (table 1-1)."""
 UNSIGNED, MATRIX, COMPRESSED = 6, 14, 15
-"""Element types (table 1-1)."""
+"""Numbers of element types in the format (table 1-1)."""
 CELL, STRUCT, CHAR, NUMERIC, OPAQUE = 1, 2, 4, range(6, 16), 17
-"""Array classes (table 1-3)."""
+"""Numbers of array classes in the format (table 1-3)."""
 COMPLEX = 0x0800
 """Flag bit of an array of complex numbers."""
 NAME_WITHIN = 512

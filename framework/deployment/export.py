@@ -50,7 +50,7 @@ DENSITY_PARITY = 1e-4
 EXTRA = "pip install 'robust-visual-learning[export]'"
 SCRIPTS = ("predict", "serve")
 PACKAGE = exported_folder.__name__
-"""Package of the scripts."""
+"""Package with the scripts that are copied into an exported folder."""
 EXTREMES = {"random": 1.0, "extreme": 1e4}
 """Factors of the spread of the arrays on which the exported model is compared with the original one."""
 BATCH, FEWER = 16, 5
@@ -288,7 +288,7 @@ class ModelNoise:
         }
 
     def entry(self) -> dict[str, Any]:
-        """Return the description in density.json."""
+        """Return the entry of these random numbers in density.json."""
         dtype = str(self.dtype).removeprefix("torch.")
         return {"name": self.name, "kind": self.kind, "shape": list(self.shape), "dtype": dtype}
 

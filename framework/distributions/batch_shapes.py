@@ -192,7 +192,7 @@ def _(density: Reshaped, value: Tensor) -> protocol.Estimate:
 
 
 def _register_number(function: Any) -> None:
-    """Register a function of density and value for `Stacked` and `Reshaped`: apply it to the inner densities.
+    """Register methods that apply a function of density and value to the densities in `Stacked` and `Reshaped`.
 
     The function returns a tensor (*sample, *batch) or None.
     """

@@ -5,7 +5,7 @@ from torch import Tensor
 from torch.distributions import Categorical, Distribution
 
 LONGEST = 200
-"""Largest number of characters of the line."""
+"""Largest number of characters of the line that describes a density."""
 WHOLE = 6
 """Largest number of elements up to which a parameter is printed in full; of a longer one, the range is printed."""
 

@@ -27,7 +27,7 @@ class Noise:
     dtype: torch.dtype
 
     def draw(self, generator: torch.Generator) -> Tensor:
-        """Return such numbers."""
+        """Return an array of random numbers of this kind, shape and type."""
         create = torch.rand if self.kind == UNIFORM else torch.randn
         return create(self.shape, generator=generator, dtype=self.dtype)
 

@@ -93,7 +93,7 @@ class Files:
 
     @property
     def digest(self) -> str:
-        """Return a hash of the names."""
+        """Return a hash of the names of the files."""
         return hashlib.sha256(self.text).hexdigest()
 
     def files(self, number: int) -> list[Path]:
@@ -263,7 +263,7 @@ def require_apart(root: Path, into: Path) -> None:
     """Refuse a folder for the features that lies inside the folder of the files.
 
     Raises:
-        ConfigError: It does.
+        ConfigError: The folder lies there.
     """
     if into.resolve().is_relative_to(root.resolve()):
         raise ConfigError(

@@ -41,19 +41,20 @@ class Laplace(Uncertainty, ReadsTraining):
 
     The posterior of the weights is N(W*, (H + λ I)⁻¹): W* are the trained weights, H is the Fisher information of the
     training split, which is the generalised Gauss-Newton matrix for natural parameters, and λ is the precision of a
-    normal prior (posterior.py). The wrapped model may have any density head that has a final linear layer; it trains as
-    it would alone. The S draws use the same noise in every prediction. Before `calibrate` the densities are those of
-    the model. If `calibrate` gets no training split, it fits H to the samples that it is given.
+    normal prior (posterior.py). The wrapped model may have any density head that has a final linear layer; the model
+    trains as it would without the wrapper. The S draws use the same noise in every prediction. Before `calibrate`, the
+    wrapper returns the densities of the model. If `calibrate` gets no training split, it fits H to the samples that it
+    is given.
 
     Args:
         covariance: "full" for all weights together; "kronecker" for a product of a matrix over raw parameters and one
             over features; "diagonal" for independent weights.
         prior_precision: λ, or how it is chosen: "marginal" by the marginal likelihood of the training split,
-            "validation" by the likelihood of the validation split, where no spread of the weights is a choice too.
+            "validation" by the likelihood of the validation split; the choices then include weights without any spread.
 
     Attributes:
         samples: S, which may be changed after training (a knob).
-        precision: λ, a float64 buffer; infinite before `calibrate`, and if no spread is best.
+        precision: λ, a float64 buffer; infinite before `calibrate`, and if weights without any spread are best.
 
     Raises:
         ConfigError: the model has no final linear layer, or too many weights for a full covariance; it is inside
@@ -254,10 +255,10 @@ class Laplace(Uncertainty, ReadsTraining):
 
 
 def final_layer(model: Predictor) -> nn.Linear:
-    """Return the final linear layer of a model: its projection, or the last one of any other predictor.
+    """Return the final linear layer: the projection of a `Model`, or the last linear layer of any other predictor.
 
     Raises:
-        ConfigError: there is none, or the model is inside another wrapper.
+        ConfigError: the model has no linear layer, or it is inside another wrapper.
     """
     if any(isinstance(module, Uncertainty) for module in model.modules()):
         raise ConfigError(
