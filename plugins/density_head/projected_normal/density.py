@@ -1,0 +1,133 @@
+"""Independent projected normal angles as a torch distribution."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.distributions import Distribution, constraints
+
+from framework.distributions.circular import circular, grid, wrap
+from framework.distributions.description import one_line
+from framework.distributions.panels import entropy_of_one
+from framework.distributions.protocol import estimate, exact_estimate, marginal, mode_candidates, pick, take
+from plugins.density_head.projected_normal import functions
+
+POINTS = 180
+"""Number of angles of the grid on which the search for the mode begins."""
+STEPS = 70
+"""Number of steps of the golden-section search; each shortens the interval by a factor of 0.618."""
+
+
+class ProjectedNormal(Distribution):
+    """Directions of independent normal vectors N(μ, P⁻¹) in the plane, one for each angle.
+
+    The density has one or two peaks and may be skewed. With s = t = 0, P is the unit matrix, and the density is
+    symmetric around the direction of μ.
+
+    Args:
+        mean: μ, (*batch, angle, 2).
+        factor: s and t of P = LLᵀ (`functions`), (*batch, angle, 2).
+        dtype: dtype of all results; by default that of `mean`. All computations are in float64.
+    """
+
+    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
+    has_rsample = False
+    __repr__ = one_line
+
+    def __init__(
+        self,
+        mean: Float[Tensor, "*batch angle 2"],
+        factor: Float[Tensor, "*batch angle 2"],
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        self.mean_vector, self.factor = mean, factor
+        self.dtype = dtype or mean.dtype
+        super().__init__(mean.shape[:-2], mean.shape[-2:-1], validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint:
+        return circular
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return self._of_each(value).sum(-1).to(self.dtype)
+
+    def _of_each(self, value: Tensor) -> Tensor:
+        """Return the log-density of each angle, float64."""
+        return functions.log_prob(value.double(), self.mean_vector.double(), self.factor.double())
+
+    @torch.no_grad()
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        shape = torch.Size(sample_shape) + self.batch_shape + self.event_shape
+        first, second = torch.randn(2, *shape, dtype=torch.float64, device=self.mean_vector.device)
+        grow, shear = self.factor.double().unbind(-1)
+        # L⁻ᵀ z has the covariance (LLᵀ)⁻¹
+        second = torch.exp(grow) * second
+        first = torch.exp(-grow) * (first - shear * second)
+        x, y = self.mean_vector.double().unbind(-1)
+        return torch.atan2(y + second, x + first).to(self.dtype)
+
+    @property
+    @torch.no_grad()
+    def mode(self) -> Tensor:
+        """Angles of the highest densities, (*batch, angle)."""
+        candidates = self.candidates()
+        best = self._of_each(candidates).argmax(0, keepdim=True)
+        return candidates.gather(0, best).squeeze(0).to(self.dtype)
+
+    @torch.no_grad()
+    def candidates(self) -> Float[Tensor, "3 *batch angle"]:
+        """Return three angles for each angle, at least one of which is its mode, float64.
+
+        A golden-section search begins at the two highest maxima on a grid, and at the direction of μ, around which
+        a concentrated density has its only peak.
+        """
+        around = grid(POINTS, dtype=torch.float64, device=self.mean_vector.device)
+        shape = (POINTS, *(1,) * (len(self.batch_shape) + 1))
+        height = self._of_each(around.reshape(shape))
+        higher = height >= torch.maximum(height.roll(1, 0), height.roll(-1, 0))
+        summits = height.where(higher, -math.inf).topk(2, 0).indices
+        x, y = self.mean_vector.double().unbind(-1)
+        start = torch.cat([around[summits], torch.atan2(y, x).unsqueeze(0)])
+        reach = torch.full_like(start, 2 * math.pi / POINTS)
+        # |P| = 1: no direction of the normal vector is wider than the norm of L
+        norm = 1 + self.factor.double().abs().sum(-1).exp()
+        reach[2] = (4 * norm / torch.hypot(x, y).clamp(min=1e-300)).clamp(max=2 * math.pi / POINTS)
+        return wrap(self._highest(start - reach, start + reach))
+
+    def _highest(self, low: Tensor, high: Tensor) -> Tensor:
+        """Return the maximum between `low` and `high` by golden-section search (Kiefer 1953)."""
+        ratio = (math.sqrt(5) - 1) / 2
+        for _ in range(STEPS):
+            left, right = high - ratio * (high - low), low + ratio * (high - low)
+            rises = self._of_each(left) < self._of_each(right)
+            low, high = torch.where(rises, left, low), torch.where(rises, high, right)
+        return (low + high) / 2
+
+    def entropy(self) -> Tensor:
+        """Return the entropy, nats, (*batch), by quadrature; without gradient."""
+        parts = [entropy_of_one(marginal(self, index)) for index in range(self.event_shape[0])]
+        return torch.stack(parts).sum(0).to(self.dtype)
+
+
+estimate.register(ProjectedNormal, exact_estimate)
+
+
+@marginal.register
+def _(density: ProjectedNormal, index: int) -> ProjectedNormal:
+    part = slice(index, index + 1)
+    return ProjectedNormal(density.mean_vector[..., part, :], density.factor[..., part, :], density.dtype)
+
+
+@pick.register
+def _(density: ProjectedNormal, index: Tensor) -> ProjectedNormal:
+    mean, factor = (
+        take(part.flatten(-2), index).unflatten(-1, (-1, 2)) for part in (density.mean_vector, density.factor)
+    )
+    return ProjectedNormal(mean, factor, density.dtype)
+
+
+@mode_candidates.register
+def _(density: ProjectedNormal) -> Tensor:
+    candidates = density.candidates().to(density.dtype)
+    return torch.cat([density.mode.unsqueeze(0), candidates])
