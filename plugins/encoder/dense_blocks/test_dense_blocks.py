@@ -80,12 +80,6 @@ def test_the_layer_after_the_narrow_one_has_its_rank():
     assert torch.linalg.matrix_rank(outputs - wide.bias.detach()) == 2
 
 
-def test_bytes_are_read_as_0_to_1():
-    encoder = DenseBlocks((1, 4, 4), width=3).eval()
-    pixels = torch.randint(0, 256, (5, 1, 4, 4), dtype=torch.uint8)
-    torch.testing.assert_close(encoder(pixels), encoder(pixels.float() / 255))
-
-
 def test_dropout_acts_in_training_alone():
     torch.manual_seed(0)
     encoder = DenseBlocks((4,), blocks=1, layers=1, width=2000, dropout=0.25)
