@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from io import TextIOWrapper
@@ -24,6 +25,26 @@ docs/start/by_task.md names the first command for your task and your own files;
 docs/commands.md lists all commands.
 """
 """Text for a command without arguments."""
+PAGES = {
+    "hydra/launcher=": "docs/engines.md",
+    "hydra/sweeper=": "docs/search.md",
+    "resume=": "docs/how_to/resume.md",
+    "budget.": "docs/how_to/budgets.md",
+    "mode=render": "docs/how_to/render.md",
+    "mode=export": "docs/export.md",
+    "mode=new": "docs/how_to/add_a_plugin.md",
+    "mode=check": "docs/how_to/add_a_plugin.md",
+    "mode=sync": "docs/how_to/tracking.md",
+    **dict.fromkeys(("logger=[", "logger=tensorboard", "logger=wandb", "logger."), "docs/how_to/tracking.md"),
+    "mode=": "docs/commands.md",
+    "data=tabular": "docs/tables.md",
+    "data.": "docs/how_to/own_data.md",
+    "-m": "docs/how_to/sweeps.md",
+    "--multirun": "docs/how_to/sweeps.md",
+}
+"""Page of the documentation that helps after an error, by the beginning of a word of the command; the first counts."""
+FIRST_PAGE = "docs/start/by_task.md"
+"""Page that helps after an error of any other command."""
 
 
 def main() -> None:
@@ -40,10 +61,11 @@ def main() -> None:
     # Hydra prints its own errors and exits unless told to raise them.
     full_error = os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"
+    arguments = sys.argv[1:]
     try:
         _run()
     except UserError as error:
-        _fail(str(error), 2 if isinstance(error, ConfigError) else 1)
+        _fail(str(error), 2 if isinstance(error, ConfigError) else 1, page_of(arguments))
     except KeyboardInterrupt:
         _fail("interrupted.", 130)
     except Exception as error:
@@ -54,7 +76,7 @@ def main() -> None:
         message = None if full_error == "1" else refused or describe_error(error)
         if message is None:
             raise
-        _fail(message, 1 if refused else 2)
+        _fail(message, 1 if refused else 2, "" if refused else page_of(arguments))
 
 
 def _run() -> None:
@@ -120,6 +142,16 @@ def _version() -> str:
     return f"robust-visual-learning {__version__} (Python {sys.version.split()[0]})"
 
 
-def _fail(message: str, code: int) -> None:
+def page_of(arguments: Sequence[str]) -> str:
+    """Return the page of the documentation that helps after an error of a command."""
+    words = [word.lstrip("+~") for word in arguments]
+    return next(
+        (page for start, page in PAGES.items() if any(word.startswith(start) for word in words)), FIRST_PAGE
+    )
+
+
+def _fail(message: str, code: int, page: str = "") -> None:
     sys.stderr.write(f"error: {message}\n")
+    if page:
+        sys.stderr.write(f"help:  {page}\n")
     sys.exit(code)

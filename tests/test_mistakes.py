@@ -12,7 +12,7 @@ import pytest
 import yaml
 from hydra.core.global_hydra import GlobalHydra
 
-from framework.app import main
+from framework.app import FIRST_PAGE, PAGES, START, main, page_of
 from framework.configuration import composition
 from tests.conftest import first_of_each
 
@@ -227,6 +227,7 @@ experiment=moons/vanilla_128 encoder.mlp.width=3 | Did you mean 'widths'?
 """
 
 
+ROOT = Path(__file__).parent.parent
 FOLDERS = cache(composition.config_folders)
 """Found once for all commands."""
 
@@ -257,7 +258,12 @@ def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
         assert ended.value.code in (1, 2)
         assert said.startswith("error: ")
         assert said.endswith("\n")
-        assert said.count("\n") == 1, said
+        assert said.count("\n") <= 2, said
+        said, _, page = said.partition("\n")
+        said += "\n"
+        if page:
+            assert page.startswith("help:  docs/") and page.endswith(".md\n"), page
+            assert (ROOT / page.removeprefix("help:  ").strip()).is_file(), page
         assert not [*(tmp_path / "here").rglob("*.*")], "a mistake is not a run"
         return said
 
@@ -386,3 +392,32 @@ def test_a_file_that_a_run_reads_is_not_taken_for_a_config() -> None:
 
 def test_there_are_a_hundred_and_fifty() -> None:
     assert len(set(MISTAKES.strip().splitlines())) >= 150
+
+
+@pytest.mark.parametrize(
+    ("command", "page"),
+    [
+        ("data=moons", "docs/start/by_task.md"),
+        ("experiment=nope", "docs/start/by_task.md"),
+        ("-m experiment=nope seed=0,1", "docs/how_to/sweeps.md"),
+        ("-m experiment=nope hydra/launcher=slurm", "docs/engines.md"),
+        ("mode=render", "docs/how_to/render.md"),
+        ("mode=predict checkpoint=x budget.error=1", "docs/how_to/budgets.md"),
+        ("mode=test", "docs/commands.md"),
+        ("data=tabular +data.targt=y", "docs/tables.md"),
+        ("experiment=moons/vanilla_128 logger=[csv,mlflw]", "docs/how_to/tracking.md"),
+    ],
+)
+def test_an_error_leads_to_the_page_about_the_command(command: str, page: str) -> None:
+    assert page_of(shlex.split(command)) == page
+
+
+def test_the_texts_of_a_beginner_name_pages_that_exist(capsys: pytest.CaptureFixture[str]) -> None:
+    """Check the command without arguments, `--help`, and every page that an error can name."""
+    texts = [START, composition.help_text(), FIRST_PAGE, *PAGES.values()]
+    for text in texts:
+        pages = re.findall(r"docs/[\w/]+\.md", text)
+        assert pages and all((ROOT / page).is_file() for page in pages), text
+    for text in texts[:2]:
+        assert "docs/start/by_task.md" in text and "docs/commands.md" in text
+        assert all(len(line) <= 80 for line in text.splitlines())
