@@ -200,6 +200,7 @@ NOT_IN_THE_THESIS = {
     "metric/crps",
     "metric/decision_cost",
     "metric/errors",
+    "metric/mutual_information",
     "metric/pit",
     "metric/pixel_uncertainty",
     "metric/pose_error",

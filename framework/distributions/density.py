@@ -51,8 +51,13 @@ class Mixture(Distribution):
     Args:
         log_weights: (*batch, K), nats. They are normalised here, so logits are accepted. -inf is a weight of zero.
         components: one density with batch_shape (*batch, K).
+
+    Attributes:
+        over_models: True if the components are the predictions of several models, or of one model with several weights,
+            as wrappers return them; False if they are parts of the density of one model.
     """
 
+    over_models = False
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
     has_rsample = False
     __repr__ = one_line

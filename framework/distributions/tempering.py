@@ -101,7 +101,9 @@ def _(density: Mixture, temperature: Tensor) -> Distribution:
     """
     if density.has_enumerate_support:
         return tempered_classes(density, temperature)
-    return Mixture(density.log_weights, tempered_density(density.components, temperature))
+    tempered = Mixture(density.log_weights, tempered_density(density.components, temperature))
+    tempered.over_models = density.over_models
+    return tempered
 
 
 def tempered_classes(density: Distribution, temperature: Tensor) -> "RescaledClasses":

@@ -10,6 +10,7 @@ from torchmetrics.utilities.data import dim_zero_cat
 
 from framework.distributions.checks import refuse_nan
 from framework.distributions.class_probabilities import class_probabilities
+from framework.distributions.model_mixtures import expected_entropy
 from framework.metric import Metric
 from framework.prediction import Prediction, Split
 
@@ -19,7 +20,8 @@ class OutOfDistribution(Metric):
 
     - `ood_entropy`, `ood_entropy_sem`: mean entropy on outliers and its standard error; `entropy_test`: mean entropy on
       the test split. One infinite entropy makes the mean infinite.
-    - `auroc`: probability that an outlier has a higher score than a test sample; equal scores count half.
+    - `auroc`, `auroc_sem`: probability that an outlier has a higher score than a test sample, and its standard error
+      over both (DeLong et al. 1988); equal scores count half. The error is NaN with a single outlier or test sample.
     - `aupr`: average precision with outliers as the positives; it depends on the share of outliers.
     - `fpr95`: share of test samples that are classified as outliers at the highest threshold that detects 95 % of the
       outliers. A score equal to the threshold counts as above it (Hendrycks et al. 2019). Papers that use the test
@@ -30,13 +32,14 @@ class OutOfDistribution(Metric):
     Args:
         score: score that is high on outliers. "entropy" is the entropy of the density. "confidence" is the negative
             confidence: the confidence is the largest probability for classes (Hendrycks & Gimpel 2017), and the
-            log-density at the mode for other targets.
+            log-density at the mode for other targets. "mutual_information" is that of target and model, 0 for a single
+            model (Depeweg et al. 2018; framework.distributions.model_mixtures).
 
     Raises:
         UserError: entropies or scores are NaN.
     """
 
-    bibtex = "hendrycks2019deep"
+    bibtex = "hendrycks2019deep, delong1988comparing, depeweg2018decomposition"
     splits: ClassVar[tuple[Split, ...]] = ("test", "outliers")
     columns: ClassVar[dict[str, str]] = {
         "ood_entropy": "OOD entropy",
@@ -53,7 +56,7 @@ class OutOfDistribution(Metric):
     test: list[Tensor] | Tensor
     outliers: list[Tensor] | Tensor
 
-    def __init__(self, *, score: Literal["entropy", "confidence"] = "entropy") -> None:
+    def __init__(self, *, score: Literal["entropy", "confidence", "mutual_information"] = "entropy") -> None:
         super().__init__()
         self.score = score
         # (entropy, score) of each sample; rankings require all samples
@@ -68,6 +71,11 @@ class OutOfDistribution(Metric):
         score = entropy
         if self.score == "confidence":
             score = refuse_nan(uncertainty_score(prediction.density), f"confidences in {where}")
+        if self.score == "mutual_information":
+            expected = refuse_nan(
+                expected_entropy(prediction.density).double(), f"expected entropies of {where}"
+            )
+            score = torch.where(entropy == expected, 0.0, entropy - expected)
         collected = self.outliers if prediction.split == "outliers" else self.test
         assert isinstance(collected, list)
         collected.append(torch.stack([entropy, score], -1))
@@ -100,11 +108,14 @@ def uncertainty_score(density: Distribution) -> Float64[Tensor, "batch"]:
 def ranking(
     outliers: Float[Tensor, "outlier"], test: Float[Tensor, "sample"]
 ) -> dict[str, Float64[Tensor, ""]]:
-    """Return `auroc`, `aupr` and `fpr95` of two sets of scores, with outliers as positives; NaN if a set is empty."""
+    """Return `auroc`, its error, `aupr` and `fpr95` of two sets of scores, with outliers as positives.
+
+    All are NaN if a set is empty.
+    """
     test_count, outlier_count = len(test), len(outliers)
     if test_count == 0 or outlier_count == 0:
         undefined = outliers.new_tensor(torch.nan, dtype=torch.float64)
-        return {"auroc": undefined, "aupr": undefined.clone(), "fpr95": undefined.clone()}
+        return {name: undefined.clone() for name in ("auroc", "auroc_sem", "aupr", "fpr95")}
     test, outliers = test.sort().values, outliers.sort().values
     lower = torch.searchsorted(test, outliers)  # number of test samples below each outlier
     upper = torch.searchsorted(test, outliers, right=True)  # number of test samples not above it
@@ -113,13 +124,26 @@ def ranking(
     precision = at_or_above.double() / (at_or_above + test_count - lower)
     # the smallest number of outliers that is at least 95 %, in integers: 0.95 × 20 must give 19
     threshold = outliers[outlier_count - (95 * outlier_count + 99) // 100]
+    shares = (lower + upper).double() / (2 * test_count)  # share of test samples below each outlier
+    above = outlier_count - torch.searchsorted(outliers, test, right=True)
+    ties = outlier_count - torch.searchsorted(outliers, test)
+    # DeLong, DeLong & Clarke-Pearson 1988: variances of the shares over outliers and over test samples
+    variance = (
+        _variance(shares) / outlier_count
+        + _variance((above + ties).double() / (2 * outlier_count)) / test_count
+    )
     return {
+        "auroc_sem": variance.sqrt(),
         # Mann & Whitney 1947: (#{test < s} + #{test ≤ s}) / 2 over all outliers s, exact up to the division
         "auroc": (lower + upper).sum().double() / (2 * test_count * outlier_count),
         # average precision Σ ΔR P: each of m outliers raises the recall by 1/m at the precision of its own score
         "aupr": precision.mean(),
         "fpr95": (test >= threshold).double().mean(),
     }
+
+
+def _variance(values: Float64[Tensor, "sample"]) -> Float64[Tensor, ""]:
+    return values.var() if len(values) > 1 else values.new_tensor(torch.nan)
 
 
 def _concatenate(collected: list[Tensor] | Tensor) -> Float64[Tensor, "sample 2"]:

@@ -1,4 +1,4 @@
-"""Contract-test cases: both scores, for classes, real numbers and angles."""
+"""Contract-test cases: all scores, for classes, real numbers and angles."""
 
 from framework.target import Target
 from framework.testing.rows import MetricRow
@@ -7,12 +7,14 @@ CLASSES = Target("class", ("a", "b", "c"))
 REALS = Target("real", ("x", "y"))
 ANGLE = Target("angle", ("azimuth",))
 
+SINGLE = {"perfect beats random": "the densities are those of single models, without mutual information"}
 ROWS = {
     "out_of_distribution": (
         MetricRow("entropy of classes", CLASSES),
         MetricRow("confidence in a class", CLASSES, {"score": "confidence"}),
         MetricRow("entropy of reals", REALS),
         MetricRow("confidence in reals", REALS, {"score": "confidence"}),
+        MetricRow("mutual information of reals", REALS, {"score": "mutual_information"}, leave_out=SINGLE),
         MetricRow("entropy of an angle", ANGLE),
         MetricRow("confidence in an angle", ANGLE, {"score": "confidence"}),
     )

@@ -42,7 +42,7 @@ def compute_metric(outliers, test, **config):
 
 def rank(outliers, test):
     pair = (torch.tensor(numbers, dtype=torch.float64) for numbers in (outliers, test))
-    return {name: value.item() for name, value in ranking(*pair).items()}
+    return {name: value.item() for name, value in ranking(*pair).items() if name != "auroc_sem"}
 
 
 def loops(outliers, test):
@@ -170,7 +170,7 @@ def test_a_mixture_whose_members_disagree_is_uncertain():
 
 
 def test_outliers_or_test_samples_alone_have_no_ranking():
-    nothing, nothing_seen = {"auroc", "aupr", "fpr95"}, Known(torch.zeros(0))
+    nothing, nothing_seen = {"auroc", "auroc_sem", "aupr", "fpr95"}, Known(torch.zeros(0))
     actual = compute_metric([], [Known([1.0, 3.0])])
     assert actual["entropy_test"] == 2 and {key for key in actual if math.isnan(actual[key])} == nothing | {
         "ood_entropy",
@@ -204,3 +204,32 @@ def test_nan_raises_a_message_with_the_split():
 
 def test_the_metric_requests_outliers():
     assert OutOfDistribution.splits == ("test", "outliers")
+
+
+def test_the_error_of_auroc_is_that_of_the_definition_and_of_repeated_draws():
+    generator = torch.Generator().manual_seed(0)
+
+    def scores(count, shift):
+        return (2 * (torch.randn(count, generator=generator) + shift)).round().double()  # with equal scores
+
+    outliers, test = scores(40, 0.8), scores(60, 0.0)
+    wins = (outliers[:, None] > test).double() + 0.5 * (outliers[:, None] == test)
+    variance = wins.mean(1).var() / 40 + wins.mean(0).var() / 60  # DeLong et al. 1988
+    assert ranking(outliers, test)["auroc_sem"].item() == pytest.approx(variance.sqrt().item(), rel=1e-12)
+    draws = [ranking(scores(40, 0.8), scores(60, 0.0)) for _ in range(2000)]
+    spread = torch.stack([draw["auroc"] for draw in draws]).std()
+    assert torch.stack([draw["auroc_sem"] for draw in draws]).mean() == pytest.approx(spread.item(), rel=0.05)
+
+
+def test_members_that_disagree_are_outliers_by_mutual_information():
+    def members(logits):
+        mixture = Mixture(
+            torch.zeros(logits.shape[:2]).double(), Categorical(logits=logits, validate_args=False)
+        )
+        mixture.over_models = True
+        return mixture
+
+    disagree = members(torch.tensor([[[9.0, 0.0, -9.0], [0.0, 9.0, -9.0]]]).double())
+    undecided = members(torch.zeros(1, 2, 3).double())
+    found = compute_metric([disagree], [undecided], score="mutual_information")
+    assert found["auroc"] == 1 and compute_metric([disagree], [undecided])["auroc"] == 0

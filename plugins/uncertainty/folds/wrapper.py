@@ -103,7 +103,9 @@ class Folds(Uncertainty, SelfTraining):
         if len(groups) == 1:
             return groups[0]
         weights = self.log_weights.to(groups[0].log_weights)
-        return Mixture(weights.expand(*groups[0].batch_shape, -1), Stacked(groups))
+        pooled = Mixture(weights.expand(*groups[0].batch_shape, -1), Stacked(groups))
+        pooled.over_models = True
+        return pooled
 
     def _groups(self, inputs: Tensor) -> list[Mixture]:
         """Return the mixture of the models of each group, batch_shape (batch,)."""
@@ -117,6 +119,7 @@ class Folds(Uncertainty, SelfTraining):
                 fold = self._fold[self.rows.cpu()].to(like.device)
                 log_weights.fill_(-math.inf).scatter_(1, fold.unsqueeze(1), 0.0)
             mixtures.append(Mixture(log_weights, components))
+            mixtures[-1].over_models = True
         return mixtures
 
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
