@@ -169,9 +169,9 @@ def check(probabilities: np.ndarray, model: Predictor, inputs: torch.Tensor) -> 
 
 def main() -> None:
     torch.set_num_threads(1)
-    start = time.perf_counter()
+    start = time.process_time()
     freeze_predictor(predictor([MLP], (512,)), (512,))
-    freezing = time.perf_counter() - start
+    freezing = time.process_time() - start
     lines = [line for count in (1, 2, 4, 8, 16, 32, 64, 128, 256) for line in classifier_rows(count)]
     lines += [line for count in (1, 256) for line in cloud_rows(count)]
     text = (
@@ -194,8 +194,8 @@ def main() -> None:
         "| task | batch size | form | ms a call | ms a sample | speed ratio | of the best |\n"
         "|---|---|---|---|---|---|---|\n"
         + "\n".join(lines)
-        + f"\n\nFreezing the classifier with `framework.freeze` takes {freezing:.1f} s. This time includes the import "
-        "of PyTorch's exporter and the reading of compiled functions from their cache.\n\n"
+        + f"\n\nFreezing the classifier with `framework.freeze` takes {freezing:.1f} s of processor time. This time "
+        "includes the import of PyTorch's exporter and the reading of compiled functions from their cache.\n\n"
         f"{machine('torch', 'onnxruntime', 'numpy', 'numba')} Command: `python -m benchmarks.framework.frozen`.\n"
     )
     publish(__file__, text)
