@@ -110,6 +110,23 @@ def test_angles_of_many_turns_keep_their_digits(tmp_path: Path) -> None:
         np.testing.assert_allclose(fields_of(angle, name)["target"][:, 0], expected, atol=1e-6)
 
 
+def test_landmarks_and_head_poses_beyond_half_a_turn(tmp_path: Path) -> None:
+    # a table as of AFLW2000: a file name, landmarks in pixels, and a few poses beyond ±180°
+    landmarks = [f"{axis}{number}" for number in range(1, 5) for axis in "xy"]
+    poses = np.random.default_rng(0).normal(0, (20, 45, 15), (40, 3)).round(3)
+    poses[3], poses[17] = (190.5, -200.25, 10), (-12, 350, -365)
+    lines = [",".join(["image", *landmarks, "pitch", "yaw", "roll"])]
+    for row, pose in enumerate(poses):
+        lines.append(",".join(map(str, [f"image{row:05d}.jpg", *range(row, row + 8), *pose])))
+    data = prepare_data(table(tmp_path, "\n".join(lines)), target=["pitch", "yaw", "roll"], kind="degrees")
+    assert (data.target.kind, data.target.names) == ("angle", ("pitch", "yaw", "roll"))
+    assert data.input_shape == (8,)  # the names of the images are not read
+    for name in SPLITS:
+        fields = fields_of(data, name)
+        expected = (poses[fields["line"].numpy() - 2] + 180) % 360 - 180
+        np.testing.assert_allclose(np.degrees(fields["target"].double().numpy()), expected, atol=1e-4)
+
+
 def test_splits_and_groups_come_from_columns_of_these_names(tmp_path: Path) -> None:
     lines = ["split,group,x,class"]
     lines += [f"{SPLITS[row % 3]},{(10, 9, 'b')[row % 5 % 3]},{row},{row // 3 % 2}" for row in range(60)]
