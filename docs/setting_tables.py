@@ -120,8 +120,8 @@ def _note(prefix: str) -> str:
     if prefix == "trainer":
         return (
             "The keys without a meaning in this table have the one that "
-            "[Lightning's Trainer](https://lightning.ai/docs/pytorch/stable/common/trainer.html) gives them. Add one "
-            "that has no default with a plus sign: `+trainer.limit_train_batches=0.1`."
+            "[Lightning's Trainer](https://lightning.ai/docs/pytorch/stable/common/trainer.html) gives them, such as "
+            "`trainer.profiler=simple`."
         )
     if prefix == "optimizer":
         return "The defaults are those of `optimizer=adamw`. `adam` and `sgd` have other ones (`conf/optimizer/`)."

@@ -5,6 +5,7 @@ from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import NoReturn
 
+import yaml
 from hydra import compose, initialize_config_dir
 from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
@@ -29,8 +30,23 @@ def command_line(arguments: list[str]) -> list[str]:
     _refuse_code_and_passwords(arguments)
     arguments = _put_flags_first(arguments)
     require_harmless(arguments, groups())
-    arguments = _name_newest_run(_use_resumed_folder(as_stored(_list_loggers(arguments))))
+    arguments = _add_trainer_keys(_list_loggers(arguments))
+    arguments = _name_newest_run(_use_resumed_folder(as_stored(arguments)))
     return _sweep_single_values(_choose_preset(arguments))
+
+
+def _add_trainer_keys(arguments: list[str]) -> list[str]:
+    """Return the arguments with `++` before keys of Lightning's Trainer that no config of `trainer` holds.
+
+    Hydra refuses a new key without a plus sign.
+    """
+    if not any(argument.startswith("trainer.") for argument in arguments):
+        return arguments
+    from framework.configuration.settings import TrainerSettings
+
+    known = yaml.safe_load((folder() / "trainer/default.yaml").read_text(encoding="utf-8"))
+    new = {f"trainer.{key}" for key in TrainerSettings.model_fields.keys() - known.keys()}
+    return [f"++{argument}" if argument.partition("=")[0] in new else argument for argument in arguments]
 
 
 def _list_loggers(arguments: list[str]) -> list[str]:

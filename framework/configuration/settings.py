@@ -203,6 +203,7 @@ class TrainerSettings(_Strict):
     sync_batchnorm: Flag | None = None
     enable_autolog_hparams: Flag | None = None
     profiler: Literal["simple", "advanced", "pytorch", "xla"] | None = None
+    """Profiler of Lightning; its report on the training is `fit-profile.txt` in the run folder."""
     model_registry: str | None = None
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import pytorch_lightning as pl
 import torch
+from pytorch_lightning.profilers import AdvancedProfiler, PyTorchProfiler, SimpleProfiler
 from rich.console import Console
 from torch import distributed as dist
 
@@ -18,7 +19,7 @@ from framework.errors import ConfigError
 from framework.model import FrozenFrontEnd, fitted_models, learns
 from framework.runs.job import PRUNED, RECORD
 from framework.runs.resuming import begin_again, resume_arguments
-from framework.runs.run import Run
+from framework.runs.run import PROFILE, Run
 from framework.runs.session import Session, trained_batches
 from framework.storage.checkpoints import read
 from framework.storage.first_rank import first_rank
@@ -41,6 +42,9 @@ from framework.training.module import (
 from framework.training.progress import Progress
 from framework.training.rank_processes import end_together
 from framework.uncertainty import SelfTraining, outermost, self_training
+
+PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": PyTorchProfiler}
+"""Profilers of Lightning whose report the run folder receives, by the value of `trainer.profiler`."""
 
 
 class Fitted(NamedTuple):
@@ -238,6 +242,9 @@ def _trainer(run: Run, keep: KeepCheckpoints, console: Console) -> pl.Trainer:
         console.print(f"precision: {precision}, which trainer.precision=auto chooses for this processor")
         run.tracker.set_tags({"precision": precision})
     arguments |= {"enable_progress_bar": False}  # Lightning's own progress bar
+    if arguments.get("profiler") in PROFILERS:
+        arguments["profiler"] = PROFILERS[arguments["profiler"]](dirpath=run.folder, filename="profile")
+        console.print(f"profile: {run.folder / PROFILE}, after the training", soft_wrap=True, highlight=False)
     defaults = {"enable_model_summary": False, "num_sanity_val_steps": 0, "profiler": NoProfiler()}
     return pl.Trainer(
         **{**defaults, **arguments},

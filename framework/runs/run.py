@@ -28,6 +28,8 @@ from framework.tracking.watch import start_watcher
 
 TRACEBACK = "traceback.txt"
 """File with the traceback of a run that failed or was stopped; it is removed when the run is resumed and finishes."""
+PROFILE = "fit-profile.txt"
+"""File with the report of the profiler of a training (`trainer.profiler`); Lightning gives it this name."""
 LEFT_BY_RUNS = (
     "config.yaml",
     "overrides.yaml",
@@ -41,6 +43,7 @@ LEFT_BY_RUNS = (
     "work_precision.csv",
     TRACEBACK,
     "unreadable.txt",
+    PROFILE,
     "metrics.csv",
     "tensorboard",
     "wandb",
