@@ -87,8 +87,8 @@ class Sweep:
             time.sleep(0.2)
         running = sum(_status(job) == "RUNNING" for job in self.jobs)
         return (
-            f"after {time.monotonic() - self.begun:.0f} s, when each of them had sent {LINES} lines or more "
-            f"({sum(map(_sent, self.jobs)):,} together) and {running} were running"
+            f"after {time.monotonic() - self.begun:.0f} s, when each job had sent {LINES} lines or more "
+            f"({sum(map(_sent, self.jobs)):,} by all jobs) and {running} jobs were running"
         )
 
     def finish(self) -> float:

@@ -273,7 +273,7 @@ class CircularPower(Distribution):
         return angle, (arc.log() + math.log(step)).squeeze(-1).expand(angle.shape[:-1])
 
     def _narrow(self) -> Float[Tensor, "*batch 1"]:
-        """Return the stretch s that the grid needs, at most 1: its spacing at the mode, divided by the mean spacing."""
+        """Return the stretch s of the grid, at most 1: the grid's spacing at the mode, divided by its mean spacing."""
         # width of the normal density with the same height; p^(1/T) is √T times as wide
         width = (-self.density.log_prob(self.start).detach().double()).exp() / math.sqrt(2 * math.pi)
         width = width * self.temperature.detach().double().sqrt()

@@ -630,7 +630,7 @@ def inherit_settings(config: Config, description: Description) -> Config:
 
 
 def require_fit(data: Data, description: Description) -> None:
-    """Refuse prepared data whose inputs or targets are not those of the model.
+    """Refuse prepared data if the model cannot read their inputs or predicts other targets.
 
     Raises:
         CheckpointError: The inputs have another shape, or the targets differ.

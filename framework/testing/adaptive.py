@@ -304,7 +304,7 @@ def _evaluate_boxes(
     """Return the corners of boxes, their masses, the urgency to split each, and the axis along which to split it.
 
     The corners are `low` and `high`. Masses and urgency have shape (box, rows). The axis is a mask (box, rows, number).
-    The urgency is the difference of the integrals by the two rules. The urgency is raised if the integrand at a
+    The urgency is the difference of the integrals by two quadrature rules. The urgency is raised if the integrand at a
     candidate or near a known peak is far above the integrand at every node. It is also raised if the integrand at a
     known peak differs from its extrapolation from the nodes.
 

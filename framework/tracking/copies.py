@@ -1,7 +1,7 @@
 """Further forms in which the numbers of a run are written beside its journal: CSV, TensorBoard, Weights & Biases.
 
 Nothing leaves the machine by default. Weights & Biases writes its files into the run folder and sends nothing
-(`WANDB_MODE=offline`), unless the user sets WANDB_MODE himself.
+(`WANDB_MODE=offline`), unless the user sets WANDB_MODE.
 """
 
 import csv

@@ -293,7 +293,7 @@ class Training(pl.LightningModule):
         return max(1, min(steps, trainer.max_steps) if trainer.max_steps >= 0 else steps), epoch
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the description of the model (`configuration.description`) and the number of processes."""
+        """Add the model's description (`configuration.description`) and the number of processes to a checkpoint."""
         checkpoint["framework"] = self.description
         checkpoint["processes"] = self.trainer.world_size
 

@@ -235,7 +235,7 @@ class Wardrobe:
         return _unit(self._own_spread @ _cross(posed, self.body.faces))
 
     def _smoothed(self, posed: np.ndarray, cover: np.ndarray) -> np.ndarray:
-        """Return the vertices of a posed body, smoothed where cloth hides its details, by the share `cover`.
+        """Return the vertices of a posed body, each smoothed by the share `cover` of its details that cloth hides.
 
         Each step averages over neighbours, and then undoes the shrinking that averaging causes (Taubin 1995).
         """

@@ -101,7 +101,7 @@ class ImagesWithAngles(Data):
                 )
 
     def _labels(self) -> tuple[Path, Table]:
-        """Return the folder, and the table that was read from it."""
+        """Return the folder of the images, and the table of angles in it."""
         if self.root is None:
             raise DataError(
                 "data.root is not set. Set data.root to the folder that holds your images and their table."

@@ -125,7 +125,7 @@ class PoseFromImage(Data):
         return self._splits
 
     def _spread(self) -> Float[np.ndarray, "number"]:
-        """Return the standard deviation of each parameter; for movements, before they are clipped to their limits."""
+        """Return the standard deviation of each parameter, before movements are clipped to their limits."""
         spread, displacement = self.body_model.spread.numpy().copy(), self.displacement
         shape = 6 + len(self.body_model.slots)
         spread[:3], spread[3:6] = math.radians(displacement.turned_deg) / 3**0.5, displacement.moved / 3**0.5

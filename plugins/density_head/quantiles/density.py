@@ -139,7 +139,7 @@ class PiecewiseQuantiles(Distribution):
         return torch.where(piece == 0, lower, torch.where(piece == last, upper, inner))
 
     def _distance(self, share: Tensor) -> Tensor:
-        """Return the distance from the beginning of a tail (unit: its scale) beyond which `share` of it lies."""
+        """Return the distance from a tail's beginning, in units of its scale, beyond which `share` of its mass lies."""
         return -share.log() if self.tail == 0 else torch.expm1(-self.tail * share.log()) / self.tail
 
     def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:

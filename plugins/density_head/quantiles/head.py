@@ -83,7 +83,7 @@ class QuantilesHead(DensityHead):
         return PiecewiseQuantiles(location, steps * unit, self.levels, self.tail)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return twice the mean pinball loss of each sample, without the corrections."""
+        """Return twice the mean pinball loss of each sample, before the corrections that `calibrate` finds."""
         quantiles = PiecewiseQuantiles(*self._parts(raw), self.levels, self.tail).quantiles
         gap = self.unit.standardise(target).to(quantiles) - quantiles
         levels = self.levels.to(quantiles)
@@ -91,7 +91,7 @@ class QuantilesHead(DensityHead):
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Set the corrections, such that the stated share of the samples, rounded up, lies below each quantile."""
+        """Set corrections, such that the share of the samples below each quantile is its probability, rounded up."""
         require_validation(raw, "The quantiles are")
         quantiles = PiecewiseQuantiles(*self._parts(raw.double()), self.levels, self.tail).quantiles
         value = self.unit.standardise(target).double()

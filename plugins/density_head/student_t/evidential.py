@@ -63,7 +63,7 @@ class EvidentialHead(DensityHead):
         return StudentT(location, scale, density.freedom.to(location))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return the negative log-likelihood of each sample, nats; its gradient contains that of the penalty."""
+        """Return the negative log-likelihood of each sample, nats; its gradient includes the penalty's gradient."""
         location, nu, alpha, root_beta = self.evidence(raw)
         value = self.unit.standardise(target).to(location)
         losses = -self._density(location, nu, alpha, root_beta).each_log_prob(value)

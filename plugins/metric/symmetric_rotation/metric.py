@@ -36,8 +36,9 @@ class SymmetricRotation(Mean):
       nats. Murphy et al. use this convention: the uniform density has -log π² = -2.29 nats. A density p per radian of
       azimuth, elevation e and tilt becomes 8 p / cos e. A density that gives mass to elevations outside of ±π/2
       describes a rotation by two triples of angles, and both are added.
-    - `optimum`: the same for the exact density; NaN if it is not known.
-    - `optimum_gap`: mean of the difference of both for each label, so that the noise of the labels nearly cancels.
+    - `optimum`: the same log-density under the exact density of the labels; NaN if it is not known.
+    - `optimum_gap`: mean of `optimum` minus `rotation_log_likelihood`, label by label, so that the noise of the labels
+      nearly cancels.
     - `spread_deg`: expected angle between a rotation drawn from the density and the nearest rotation R g, where g
       leaves the object unchanged, degrees, estimated from `draws` rotations.
     - `least_spread_deg`: the same angle for the labels, thus the spread of the exact density.
@@ -48,7 +49,7 @@ class SymmetricRotation(Mean):
     Raises:
         ConfigError: the target does not consist of the angles azimuth, elevation and tilt, in this order; or, at the
             first update, the data have no field "symmetry_group" or "true_rotation".
-        DataError: an entry of "symmetry_group" is no index of a group.
+        DataError: an entry of "symmetry_group" is not the index of a group.
         UserError: log-likelihoods are NaN.
     """
 

@@ -135,7 +135,7 @@ class Apart(nn.Module):
 
     @torch.no_grad()
     def decay(self, shares: Float[Tensor, "member"]) -> None:
-        """Shrink the parameters of each model that have two dimensions or more by a share of them."""
+        """Multiply the parameters of each model that have two dimensions or more by 1 minus the model's share."""
         for model, share in zip(self.models, shares.tolist(), strict=True):
             for parameter in model.parameters():
                 if parameter.dim() > 1 and parameter.requires_grad:

@@ -87,7 +87,7 @@ def fisher_of_raw(
 def _constant_hessian(
     density: Distribution, leaf: Float[Tensor, "batch raw"], targets: list[Tensor]
 ) -> Float[Tensor, "batch raw raw"] | None:
-    """Return the Hessian of -log p in the raw parameters if it is the same for two targets; None otherwise."""
+    """Return the Hessian of -log p in the raw parameters if two targets have the same one; None otherwise."""
     hessians = []
     try:
         for target in targets[:2]:

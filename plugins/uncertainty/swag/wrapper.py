@@ -202,7 +202,7 @@ def require_plain_weights(model: Predictor) -> None:
     """Refuse a model whose draws would be wrong.
 
     Raises:
-        ConfigError: it has batch norm, a density head with weights, or no weights at all.
+        ConfigError: the model has batch norm, a density head with weights, or no weights at all.
     """
     if any(isinstance(module, BATCH_NORM) for module in model.modules()):
         raise ConfigError(
