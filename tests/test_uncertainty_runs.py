@@ -227,3 +227,46 @@ def test_too_small_a_validation_split_is_said_before_training(
     if code:
         assert "are required, but got one sample" in done.out
         assert "run folder" not in done.out and not (done.folder / "run.json").exists()
+
+
+def test_a_posterior_is_fitted_to_the_training_split(framework: Framework) -> None:
+    done = framework(
+        *SMALL, "uncertainty=[laplace,ensemble]", "uncertainty.ensemble.members=2", "pictures=false"
+    )
+    assert results(done)["nll"] is not None
+    assert "60 samples determine" in done.out
+
+
+@pytest.mark.parametrize(
+    ("chosen", "said"),
+    [
+        (["uncertainty=[swag]", "trainer.keep=best"], "Set trainer.keep=last trainer.patience=null"),
+        (["uncertainty=[swag]", "trainer.patience=3"], "Set trainer.keep=last trainer.patience=null"),
+        (
+            ["uncertainty=[laplace,folds]"],
+            "Laplace reads the training split of the model that it wraps",
+        ),
+    ],
+)
+def test_wrappers_that_need_another_training_are_refused(
+    framework: Framework, chosen: list[str], said: str
+) -> None:
+    done = framework(*SMALL, "pictures=false", *chosen)
+    assert done.code == 2 and said in done.out, done.out
+
+
+def test_epochs_are_followed_and_cannot_be_made_up_for(framework: Framework) -> None:
+    done = framework(
+        *SMALL, "uncertainty=[swag]", "uncertainty.swag.start=0.0", "pictures=false", folder="followed"
+    )
+    assert "swag: weights of 3 epochs" in done.out, done.out
+    plain = framework(*SMALL, "pictures=false", folder="plain")
+    wrong = framework(
+        "mode=calibrate",
+        f"checkpoint={plain.folder}",
+        "uncertainty=[swag]",
+        "logger=none",
+        "threads=1",
+        folder="late",
+    )
+    assert wrong.code == 2 and "collects weights during training" in wrong.out, wrong.out

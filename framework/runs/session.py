@@ -220,18 +220,18 @@ def for_training(config: Config) -> Session:
         hint = "to continue a run that was stopped, use resume=<folder of the run>"
         console.print(f"starting a new training from the weights of {start.path} ({hint})", soft_wrap=True)
     trains_itself = next((part for part in predictor.modules() if isinstance(part, SelfTraining)), None)
+    reader = next((part for part in predictor.modules() if isinstance(part, ReadsTraining)), None)
+    if trains_itself is not None and reader is not None:
+        raise ConfigError(
+            f"{type(reader).__name__} reads the training split of the model that it wraps, but "
+            f"{type(trains_itself).__name__} trains models on parts of it. Leave one of the two out of uncertainty."
+        )
     if trains_itself is not None and not resumed:
         _refuse_training(config, f"{type(trains_itself).__name__} trains its models itself")
     if trains_itself is not None and objectives:
         raise ConfigError(
             f"{type(trains_itself).__name__} trains its models itself, so that an objective has no effect. Leave "
             "objective out, or choose another uncertainty."
-        )
-    reader = next((part for part in predictor.modules() if isinstance(part, ReadsTraining)), None)
-    if trains_itself is not None and reader is not None:
-        raise ConfigError(
-            f"{type(reader).__name__} reads the training split of the model that it wraps, but "
-            f"{type(trains_itself).__name__} trains models on parts of it. Leave one of the two out of uncertainty."
         )
     _require_whole_training(predictor, config)
     if not learns(predictor) and not resumed:

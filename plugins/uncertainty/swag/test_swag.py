@@ -147,6 +147,12 @@ def test_models_whose_draws_would_be_wrong_are_refused():
         Swag(lambda: model({"name": "mlp", "widths": [8], "batch_norm": True}))
     with pytest.raises(ConfigError, match="has weights of its own"):
         Swag(lambda: model({"name": "mlp", "widths": [8]}, {"name": "cvae", "component": "gaussian"}))
+    cvae = {"name": "cvae", "component": "gaussian"}
+    members = resolve("uncertainty", {"name": "ensemble", "members": 2})
+    with pytest.raises(
+        ConfigError, match="has weights of its own"
+    ):  # the heads of a vectorised ensemble are apart
+        Swag(lambda: build("uncertainty", members, model=lambda: model({"name": "mlp", "widths": [8]}, cvae)))
     wrapper = Swag(lambda: model({"name": "mlp", "widths": [8]}))
     wrapper.samples = 0
     with pytest.raises(ConfigError, match="samples is 0, expected 1 or more"):

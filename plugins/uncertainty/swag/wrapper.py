@@ -16,6 +16,7 @@ from framework.calibration.module_flags import BATCH_NORM
 from framework.calibration.validation import nonempty_batches
 from framework.calibration.weight_draws import weight_noise
 from framework.data import Batch
+from framework.density_head import DensityHead
 from framework.distributions.batch_shapes import Stacked
 from framework.errors import ConfigError
 from framework.model import Model, Predictor
@@ -209,8 +210,10 @@ def require_plain_weights(model: Predictor) -> None:
             "uncertainty swag draws weights, but this model has batch norm, whose stored means and variances belong to "
             "the trained weights alone. Choose an encoder without batch norm, e.g. encoder.mlp.batch_norm=false."
         )
-    heads = [module.head for module in model.modules() if isinstance(module, Model)]
-    if any(True for head in heads for _ in head.parameters()):
+    heads = [
+        module for module in model.modules() if isinstance(module, DensityHead) and list(module.parameters())
+    ]
+    if heads:
         raise ConfigError(
             "uncertainty swag draws the weights of the networks in front of the density head, but "
             f"{type(heads[0]).__name__} has weights of its own. Choose another density_head, or another uncertainty."
