@@ -211,8 +211,9 @@ def page(results: dict[str, Any]) -> str:
             f"{median_and_range(ratio_together, 2)}.",
             "",
             f"Before and after the encoding, the command takes {median_and_range(beyond, 2)} s (imports, composition "
-            f"of the config, end of the sweep). This is as long as the encoding of {CLOUDS:,} clouds itself. With a "
-            f"million clouds the share of the whole command would be {million:.2f}, computed from these two times. A "
+            f"of the config, end of the sweep). This is as long as the encoding of {CLOUDS:,} clouds itself. For a "
+            f"million clouds, the whole command would reach the share {million:.2f} of {CORES} × the rate of one core "
+            "(computed from these two times, not measured). A "
             f"command without a sweep that encodes {PART} clouds takes {median_and_range(starts, 2)} s of processor "
             f"time and {median_and_range(start_wall, 2)} s of wall time, nearly all of it its start.",
             "",

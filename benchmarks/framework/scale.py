@@ -216,9 +216,9 @@ def page(measured: dict[str, Any]) -> str:
             f"are medians of {ROUNDS} rounds, with the least and the largest in brackets.",
             "",
             f"The stored run is `{' '.join(RUN)}`, with {counts}; the store holds copies of it. The cost of a job is "
-            f"the difference of two sweeps of {FEW} and {MANY} jobs (`mode=plugins`), for each job more. Other work "
-            "used a core of the machine while the jobs and the store were measured, so their wall times are upper "
-            "bounds.",
+            f"the difference between the costs of a sweep of {MANY} jobs and of one of {FEW} jobs (`mode=plugins`), "
+            f"divided by {MANY - FEW}. Other work used a core of the machine while the jobs and the store were "
+            "measured, so their wall times are upper bounds.",
             "",
             "| cost | measured | unit |",
             "|---|---:|---|",

@@ -29,7 +29,7 @@ class _Plots(ModuleType):
 
 
 class _Signal(ModuleType):
-    """Stand-in for SciPy's module, which has the name that torchmetrics would add."""
+    """Stand-in for SciPy's module `signal` with the name `hamming`, which torchmetrics would add otherwise."""
 
     hamming = None
 

@@ -221,7 +221,7 @@ def check_recentre(density: Distribution, worst: Worst) -> None:
 
 
 def known_widths(density: Distribution) -> Tensor:
-    """Return the standard deviation, (rows,), of a normal density as high as `density`, for angles at most 1."""
+    """Return the standard deviation, (rows,), of a normal density with the same maximum; for angles, at most 1."""
     width = (-density.log_prob(density.mode).double()).exp() / math.sqrt(2 * math.pi)
     return width.clamp(max=1.0) if isinstance(density.support, Circular) else width
 
