@@ -170,7 +170,7 @@ class SymmetricSolids(Data):
 
     def augment(self, batch: Batch) -> Batch:
         labels = self._labels(batch["true_rotation"].cpu(), batch["symmetry_group"].cpu())
-        return {**batch, **{name: values.to(batch[name].device) for name, values in labels.items()}}
+        return {**batch, **{name: values.to(batch[name]) for name, values in labels.items()}}
 
     def fingerprint(self) -> Mapping[str, str]:
         digest = hashlib.sha256()
