@@ -206,13 +206,13 @@ def page(results: dict[str, Any]) -> str:
             f"| the same, whole command with its start | "
             f"{median_and_range([CLOUDS / seconds for seconds in wall], 4)} | {median_and_range(whole, 2)} |",
             "",
-            f"The last column is the share of {CORES} × the rate of one core. Compared with {CORES} processes of the "
-            f"encoder at once, which share the memory of the machine, the jobs reach "
-            f"{median_and_range(ratio_together, 2)}.",
+            f"The last column is the rate divided by {CORES} × the rate of the encoder alone on one core. "
+            "Processes that run at once share the memory of the machine: the rate of the jobs is "
+            f"{median_and_range(ratio_together, 2)} times the rate of {CORES} processes of the encoder at once.",
             "",
             f"Before and after the encoding, the command takes {median_and_range(beyond, 2)} s (imports, composition "
             f"of the config, end of the sweep). This is as long as the encoding of {CLOUDS:,} clouds itself. For a "
-            f"million clouds, the whole command would reach the share {million:.2f} of {CORES} × the rate of one core "
+            f"million clouds, the last column would be {million:.2f} for the whole command "
             "(computed from these two times, not measured). A "
             f"command without a sweep that encodes {PART} clouds takes {median_and_range(starts, 2)} s of processor "
             f"time and {median_and_range(start_wall, 2)} s of wall time, nearly all of it its start.",
@@ -223,8 +223,8 @@ def page(results: dict[str, Any]) -> str:
             + ("equal" if results["same"] else "DIFFER FROM")
             + " those of the undisturbed sweep.",
             "",
-            f"Single files cost more. The next table holds the rates of one command for {FILES:,} files in parts of "
-            "100 clouds, over the time from the end of the first part to the end of the last.",
+            f"Single files cost more than shards. The next table holds the rates of one command for {FILES:,} files "
+            "in parts of 100 clouds, over the time from the end of the first part to the end of the last.",
             "",
             "| one cloud per file | share of the encoder's rate |",
             "|---|---:|",

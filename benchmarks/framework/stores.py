@@ -211,9 +211,9 @@ def measure_cost(server: StoreServer) -> list[str]:
                     runs[name].append(completed)
     lines = [
         f"Each cell is the median of {ROUNDS} interleaved rounds (least to largest) of `{' '.join(SHORT)}`, the "
-        "shortest run. The first two columns are what the store adds to the run without one; the processor time is "
-        "that of the command with its processes, without the server. The last column is the time between the last "
-        "line of the journal and the end of the command.",
+        "shortest run. The first two columns hold the time that a run with a store takes longer than a run without a "
+        "store; the processor time includes all processes of the command, but not the server. "
+        "The last column is the time between the last line of the journal and the end of the command.",
         "",
         "| store | processor time, s | wall time, s | waiting at the end, s |",
         "|---|---:|---:|---:|",
