@@ -41,11 +41,11 @@ TIMES = 3
 
 
 EVENT_ROWS = (
-    "Three kinds of event are more than one killed command. *Two sweeps* share a folder and a job; the first is killed "
-    "and repeated, and every job must exist once and equal an undisturbed one. *The store and the run*: the server of "
-    "the store is killed, then the run; the run is resumed, the server starts again, and every number of the journal must "
-    "be in the store once. The script that makes the thesis's tables is killed while it runs a sweep, and none of its "
-    "processes may be left 10 s later.",
+    "Three kinds of event are more than one killed command. *Two sweeps* share a folder and a job; the first is "
+    "killed and repeated, and every job must exist once and equal an undisturbed one. *The store and the run*: the "
+    "server of the store is killed, then the run; the run is resumed, the server starts again, and every number of "
+    "the journal must be in the store once. The script that makes the thesis's tables is killed while it runs a "
+    "sweep, and none of its processes may be left 10 s later.",
     "",
     "| event | repetitions | kills | with a fault |",
     "|---|---:|---:|---:|",
