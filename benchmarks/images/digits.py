@@ -179,12 +179,13 @@ def reading_table() -> tuple[list[str], str]:
     if reached:
         return (
             lines,
-            f"Both readings hold {READING} of the mass, as a mean over the images, with {', '.join(reached)}.",
+            f"Each of the two readings holds {READING} of the mass, as a mean over the images, with "
+            f"{', '.join(reached)}.",
         )
     return lines, (
-        f"The aim was that both readings hold {READING} of the mass, as a mean over the images. No head reaches it: "
-        "nearly all mass is at the true reading, so in most of these images the pixels themselves tell a turned 6 "
-        "from a 9."
+        f"The aim was that each of the two readings holds {READING} of the mass, as a mean over the images. No head "
+        "reaches it: nearly all mass is at the true reading, so in most of these images the pixels themselves tell a "
+        "turned 6 from a 9."
     )
 
 
@@ -295,8 +296,8 @@ nearly the same after half a turn, so that a density with one peak must be wide 
 
 ## Turns of 6 and 9 whose digit is not given
 
-A turned 6 looks like a 9. The model sees the image alone. The table shows the mass of the predicted density within 45°
-of the true angle, and within 45° of the opposite angle.
+A turned 6 looks like a 9. The model sees only the image, and not the digit. The table shows the mass of the predicted
+density within 45° of the true angle, and within 45° of the opposite angle (the two readings of the image).
 
 {newline.join(readings)}
 
@@ -320,9 +321,9 @@ on the machine.
 
 ## Corrupted test images
 
-The same model is tested on images with the four corruptions of `data=image_folder` in five strengths. It has seen clean
-images alone. ± is the standard error over the test images, NLL is the negative log-likelihood, and ECE the expected
-calibration error; lower is better.
+The same model is tested on images with the four corruptions of `data=image_folder` in five strengths. It was trained on
+clean images only. ± is the standard error over the test images, NLL is the negative log-likelihood, and ECE the
+expected calibration error; lower is better.
 
 {newline.join(lines)}
 
