@@ -107,7 +107,7 @@ def _constant_hessian(
 
 
 def collect(
-    parts: Iterable[tuple[Float[Tensor, "batch feature"], Float[Tensor, "batch raw raw"]]],
+    parts: Iterable[tuple[Tensor, Tensor]],
     covariance: Covariance,
 ) -> tuple[Eigen, int]:
     """Return the eigenvalues and eigenvectors of the Fisher information of the weights, and the number of samples.
@@ -116,7 +116,8 @@ def collect(
     "kronecker" approximates it by (Σ_n Λ_n / N) ⊗ (Σ_n φ_n φ_nᵀ) (Martens & Grosse 2015).
 
     Args:
-        parts: features φ and Fisher information Λ of the raw parameters, batch by batch, float64.
+        parts: features φ, (batch, feature), and Fisher information Λ of the raw parameters, (batch, raw, raw), batch by
+            batch, float64.
         covariance: form of the matrix.
     """
     count = 0

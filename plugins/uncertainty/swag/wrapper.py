@@ -80,7 +80,7 @@ class Swag(Uncertainty, FollowsTraining):
         self.register_buffer("squares", torch.zeros_like(weights))
         self.register_buffer("deviations", weights.new_zeros(rank, len(weights)))
         numbers = {"mean": FINITE, "squares": FROM_0, "deviations": FINITE}
-        require_state(self, count=(0, 2**62), next_epoch=(0, 2**62), **numbers)
+        require_state(self, count=FROM_0, next_epoch=FROM_0, **numbers)
         self._cached: tuple[Any, list[Tensor]] | None = None
 
     def _parameters_by_name(self) -> dict[str, nn.Parameter]:
