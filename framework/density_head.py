@@ -100,6 +100,12 @@ class Fitted(ABC):
     head's state may have any shape: `load_state_dict` of a newly built head accepts every stored shape.
     """
 
+    remark: str = ""
+    """A sentence for the user about the result of `fit`; "" if there is nothing to report.
+
+    Runs print it, and checkpoints store it.
+    """
+
     @abstractmethod
     def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
         """Fit the head to all training samples, in place.

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.data import Batch
+from framework.density_head import Fitted
 from framework.model import FrozenFrontEnd, Predictor
 
 
@@ -218,8 +219,8 @@ class _Features:
 
 
 def remarks(predictor: Predictor) -> tuple[str, ...]:
-    """Return the remarks that the wrappers of a predictor set in `calibrate`, the innermost last."""
-    notes = (module.remark for module in predictor.modules() if isinstance(module, Uncertainty))
+    """Return the remarks of the wrappers of a predictor and of fitted heads, the innermost last."""
+    notes = (module.remark for module in predictor.modules() if isinstance(module, Uncertainty | Fitted))
     return tuple(dict.fromkeys(remark for remark in notes if remark))
 
 

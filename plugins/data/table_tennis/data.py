@@ -26,6 +26,7 @@ from plugins.data.table_tennis.picture import side_view
 from plugins.data.table_tennis.recordings import (
     SUFFIXES,
     Flight,
+    LengthsIn,
     TimesIn,
     count_missing_frames,
     drop_repeated,
@@ -59,6 +60,7 @@ class TableTennis(Data):
         forget: Share of the observed frames that are hidden at random from each training window.
         unreadable: Treatment of files that cannot be read. "error" refuses them, "skip" leaves them out.
         times_in: Unit of the times in the files.
+        lengths_in: Unit of the positions in the files; targets and predictions are in metres.
         writing: Notation of the CSV files: separator, decimal sign and the like.
         simulation: Settings of the simulated flights.
         constants: Constants of the simulated ball and table.
@@ -80,6 +82,7 @@ class TableTennis(Data):
         forget: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.0,
         unreadable: Literal["error", "skip"] = "error",
         times_in: TimesIn = "seconds",
+        lengths_in: LengthsIn = "metres",
         writing: Writing,
         simulation: Simulation,
         constants: Constants,
@@ -92,6 +95,7 @@ class TableTennis(Data):
         self.varies = forget > 0
         self.unreadable = unreadable
         self.times_in: TimesIn = times_in
+        self.lengths_in: LengthsIn = lengths_in
         self.writing = writing
         self.simulation = simulation
         self.constants = constants
@@ -164,7 +168,7 @@ class TableTennis(Data):
         return flights, left_out
 
     def _flights_of(self, file: Path) -> list[Flight]:
-        return flights_of(file, self.grid.step, self.times_in, self.writing)
+        return flights_of(file, self.grid.step, self.times_in, self.writing, self.lengths_in)
 
     def splits(self) -> Splits:
         return Splits(**self._tables)

@@ -22,6 +22,8 @@ COMPARED = 8
 LARGEST_STEP = 1.0
 """Largest step between frames, seconds, that data.step allows."""
 TimesIn = Literal["seconds", "milliseconds", "microseconds"]
+LengthsIn = Literal["metres", "centimetres", "millimetres"]
+METRES: dict[LengthsIn, float] = {"metres": 1.0, "centimetres": 1e-2, "millimetres": 1e-3}
 SECONDS: dict[TimesIn, float] = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6}
 FARTHEST = 100.0
 """Largest plausible coordinate of a ball, metres."""
@@ -65,7 +67,11 @@ def list_files(root: Path) -> list[Path]:
 
 
 def flights_of(
-    file: Path, step: float, times_in: TimesIn = "seconds", writing: Writing | None = None
+    file: Path,
+    step: float,
+    times_in: TimesIn = "seconds",
+    writing: Writing | None = None,
+    lengths_in: LengthsIn = "metres",
 ) -> list[Flight]:
     """Read the flights of one file; a CSV file holds one flight.
 
@@ -74,12 +80,14 @@ def flights_of(
         step: Configured seconds between two frames.
         times_in: Unit of the times in the file.
         writing: Notation of a CSV file; None for the default.
+        lengths_in: Unit of the positions in the file.
 
     Raises:
         DataError: The file is damaged, or times or positions of a flight are wrong; the message names the place.
     """
     if file.suffix.lower() == ".mat":
-        return [_check(_to_seconds(flight, times_in), step, times_in) for flight in _from_matlab(file)]
+        recorded = [_to_units(flight, times_in, lengths_in) for flight in _from_matlab(file)]
+        return [_check(flight, step, times_in) for flight in recorded]
     columns = read_columns(file, writing)
     require(columns, COLUMNS, "data.root")
     times, *positions = (numbers(columns, name, missing="") for name in COLUMNS)
@@ -87,11 +95,17 @@ def flights_of(
     if all(name in columns.cells for name in TRUE_COLUMNS):
         truth = np.stack([numbers(columns, name, missing="") for name in TRUE_COLUMNS], -1)
     flight = Flight(str(file), times, np.stack(positions, -1), truth)
-    return [_check(_to_seconds(flight, times_in), step, times_in, columns.lines)]
+    return [_check(_to_units(flight, times_in, lengths_in), step, times_in, columns.lines)]
 
 
-def _to_seconds(flight: Flight, times_in: TimesIn) -> Flight:
-    return flight if times_in == "seconds" else flight._replace(times=flight.times * SECONDS[times_in])
+def _to_units(flight: Flight, times_in: TimesIn, lengths_in: LengthsIn) -> Flight:
+    """Return the flight with times in seconds and positions in metres."""
+    if times_in != "seconds":
+        flight = flight._replace(times=flight.times * SECONDS[times_in])
+    if lengths_in == "metres":
+        return flight
+    truth = None if flight.truth is None else flight.truth * METRES[lengths_in]
+    return flight._replace(places=flight.places * METRES[lengths_in], truth=truth)
 
 
 def unread_columns(file: Path, writing: Writing | None) -> list[str]:
@@ -167,7 +181,7 @@ def _check(
         coordinates = ", ".join(f"{value:g}" for value in positions[row])
         raise DataError(
             f"{frame_name(row)}: t, x, y, z = {times[row]:g}, {coordinates}; expected seconds, and metres within "
-            f"{FARTHEST:g} of the origin. Correct the frame or remove it{_millimetres_hint(positions)}."
+            f"{FARTHEST:g} of the origin. Correct the frame or remove it{_unit_hint(positions)}."
         )
     gaps = np.diff(times)
     if (gaps <= 0).any():
@@ -201,10 +215,14 @@ def _rate_remedy(usual: float, step: float, times_in: TimesIn) -> str:
     return f"Frames must be at most {LARGEST_STEP:g} s apart. Correct the times, or set data.times_in to their unit."
 
 
-def _millimetres_hint(positions: Float[np.ndarray, "frame 3"]) -> str:
-    """Return advice about millimetres if most positions are too large for metres, otherwise an empty text."""
+def _unit_hint(positions: Float[np.ndarray, "frame 3"]) -> str:
+    """Return advice about the unit if most positions are too large for metres, otherwise an empty text."""
     usual = float(np.median(np.abs(positions).max(1)))
-    return "; divide all positions by 1000 if they are in millimetres" if usual > FARTHEST else ""
+    return (
+        "; set data.lengths_in to millimetres or centimetres if positions are in this unit"
+        if usual > FARTHEST
+        else ""
+    )
 
 
 def drop_repeated(flights: Sequence[Flight]) -> tuple[list[Flight], int]:

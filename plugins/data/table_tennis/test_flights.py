@@ -83,9 +83,12 @@ def test_unread_columns_are_remarked_and_millimetres_are_recognised(tmp_path: Pa
     rows[:, 1:] *= 1000
     write_csv(tmp_path / "0.csv", rows)
     with pytest.raises(
-        DataError, match=r"0\.csv line 2: .* divide all positions by 1000 if they are in millimetres"
+        DataError, match=r"0\.csv line 2: .* set data.lengths_in to millimetres or centimetres"
     ):
         prepare_data(root=str(tmp_path), future=5)
+    data = prepare_data(root=str(tmp_path), future=5, lengths_in="millimetres")
+    read = data.read([tmp_path / "0.csv"])[0]["input"].view(20, 5)
+    np.testing.assert_allclose(read[-1, 1:4], table(0)[-1, 1:], atol=1e-5)
 
 
 def test_a_missing_frame_is_masked_and_a_gap_in_the_future_leaves_the_window_out() -> None:

@@ -13,7 +13,7 @@ from torch.distributions import Distribution
 from framework.density_head import DensityHead, Fitted
 from framework.distributions.density import Mixture
 from framework.distributions.normals import IndependentNormals, JointNormal
-from framework.errors import NonFiniteParameters
+from framework.errors import ConfigError, NonFiniteParameters
 from framework.flights.estimation import (
     Estimate,
     ObservedFrames,
@@ -29,11 +29,14 @@ from framework.heads.parameters import require_finite
 from framework.storage.weights import require_state
 from framework.target import Target
 from plugins.density_head.flights.identification import (
+    FITTED,
+    UNITS,
     constant_bounds,
     fitted_constants,
     identify,
     replace_constants,
 )
+from plugins.density_head.flights.reference_frame import require_frame
 
 WINDOWS = 32
 """Largest number of training samples (windows of flights) from which `fit` identifies the constants."""
@@ -126,12 +129,36 @@ class BallisticHead(DensityHead, Fitted):
             torch.cat([observations.times, after], 1),
             torch.cat([observations.places, torch.where(future.abs() < 50, future, torch.nan)], 1),
         )
+        constants = require_frame(whole, self.constants, "density_head ballistic")
+        if self.identify:
+            self.found.copy_(fitted_constants(constants))
+        elif constants != self.constants:
+            raise ConfigError(
+                f"The ball bounces at a height of {constants.touching:.3f} m, but density_head.surface and "
+                f"density_head.radius put the bounces at {self.constants.touching:.3f} m. Set density_head.surface="
+                f"{constants.surface:.3f}, or density_head.identify=true."
+            )
         estimate = estimate_states(whole, self.constants, float(self.noise), self.prior, most=self.steps)
         self._measure_noise(whole, estimate.state)
         if self.identify:
-            numbers, states = identify(whole, self.constants, estimate.state, float(self.noise), self.prior)
+            before = float(self.noise)
+            numbers, states, errors = identify(whole, self.constants, estimate.state, before, self.prior)
             self.found.copy_(numbers)
             self._measure_noise(whole, states)
+            self.remark = self._describe(errors * float(self.noise) / before, len(chosen))
+
+    def _describe(self, errors: Float[Tensor, "constant"], flights: int) -> str:
+        """Return a sentence about the constants that were identified, with their standard errors."""
+        parts = [
+            f"{name} {_state_with_error(value, error)}{unit}"
+            for name, value, error, unit in zip(
+                FITTED, self.found.tolist(), errors.tolist(), UNITS, strict=True
+            )
+        ]
+        return (
+            f"ballistic: {', '.join(parts)}, noise {1000 * float(self.noise):.1f} mm, from {flights} windows of "
+            "flights. ± is the standard error if the equation is right."
+        )
 
     def _measure_noise(self, observations: ObservedFrames, states: Tensor) -> None:
         residuals = simulate(states, observations.times, self.constants)[..., :3] - observations.places
@@ -242,3 +269,11 @@ class BallisticHead(DensityHead, Fitted):
         scale = (float(self.noise) * self.spread).to(raw).expand_as(mean)
         weights = torch.zeros(shape, dtype=raw.dtype, device=raw.device)
         return Mixture(weights, IndependentNormals(mean, scale))
+
+
+def _state_with_error(value: float, error: float) -> str:
+    """Return a value and its standard error with two digits, or that the flights do not determine the value."""
+    if not 0 < error < math.inf:
+        return f"{value:.4g} (not determined by these flights)"
+    decimals = max(0, 1 - math.floor(math.log10(error)))
+    return f"{value:.{decimals}f} ± {error:.{decimals}f}"

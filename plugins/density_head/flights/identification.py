@@ -1,5 +1,6 @@
 """Identification of the constants of a ball and a table from flights, together with the states of all flights."""
 
+import math
 from dataclasses import asdict, replace
 
 import torch
@@ -13,7 +14,11 @@ from framework.flights.trajectories import simulate, simulate_with_jacobian
 FITTED = ("drag", "lift", "restitution", "friction", "surface")
 """Names of the constants that `identify` fits."""
 LOW, HIGH = (0.0, -0.02, 0.3, 0.0, -0.3), (1.0, 0.02, 1.0, 1.0, 0.3)
-"""Bounds of the constants in `FITTED`; the bounds of the surface are metres above its value in the config."""
+"""Bounds of the constants in `FITTED`; the bounds of the surface are metres above its value at the start."""
+UNITS = (" 1/m", "", "", "", " m")
+"""Unit of each constant in `FITTED`, as messages state it."""
+HIGHEST = 20.0
+"""Largest height of the table, m above or below its value in the config, of a stored head."""
 SIZES = (0.05, 0.002, 0.05, 0.05, 0.01)
 """Typical step size of each constant."""
 ROUNDS = 40
@@ -38,12 +43,12 @@ def fitted_constants(constants: Constants) -> Float[Tensor, "constant"]:
 def constant_bounds(constants: Constants) -> tuple[Float[Tensor, "constant"], Float[Tensor, "constant"]]:
     """Return lower and upper bounds that stored values of `FITTED` must satisfy.
 
-    They are the bounds of `identify`, extended to the values of the config (`constants`) if these lie outside.
+    They are the bounds of `identify`, extended to the values of the config (`constants`) if these lie outside. The
+    height of the table may be any height at which flights bounce.
     """
     values = fitted_constants(constants)
-    middle = torch.zeros_like(values)
-    middle[-1] = values[-1]
-    low, high = (middle + torch.tensor(bound, dtype=torch.float64) for bound in (LOW, HIGH))
+    low, high = (torch.tensor(bound, dtype=torch.float64) for bound in (LOW, HIGH))
+    low[-1], high[-1] = values[-1] - HIGHEST, values[-1] + HIGHEST
     return torch.minimum(low, values), torch.maximum(high, values)
 
 
@@ -53,8 +58,12 @@ def identify(
     states: Float[Tensor, "flight 9"],
     noise: float,
     prior: Prior,
-) -> tuple[Float[Tensor, "constant"], Float[Tensor, "flight 9"]]:
-    """Return the values of `FITTED` and the states that fit best, by Levenberg and Marquardt's method.
+) -> tuple[Float[Tensor, "constant"], Float[Tensor, "flight 9"], Float[Tensor, "constant"]]:
+    """Return the values of `FITTED` that fit best, the states, and the standard errors of the values.
+
+    The search is Levenberg and Marquardt's method. The standard errors are the roots of the diagonal of the inverse
+    Gauss-Newton Hessian in which the states are eliminated. They hold if the model is right and the residuals have the
+    standard deviation `noise`. They are infinite for a constant that no flight determines.
 
     A flight's state affects no other flight's residuals. So each state is eliminated on its own, and the remaining
     system has as many equations as there are constants (Schur's complement, as in bundle adjustment: Triggs et al.
@@ -80,24 +89,27 @@ def identify(
         residuals = cauchy((paths(numbers, states) - observations.places) / noise)[0].nan_to_num(0.0)
         return float(residuals.square().sum() + (states / prior.scale).square().sum()) / 2
 
+    def linearise(numbers: Tensor, states: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        places, slopes = simulate_with_jacobian(
+            states, observations.times, replace_constants(initial, numbers)
+        )
+        bent, steep = cauchy((places - observations.places) / noise)
+        bent, steep = bent.nan_to_num(0.0).flatten(1), steep.nan_to_num(0.0).unsqueeze(-1) / noise
+        shifts = torch.diag(sizes / 1000)
+        turn = [(paths(numbers + shift, states) - places) / 1e-3 for shift in shifts]
+        # states are in units of the prior, constants in units of SIZES
+        by_state = (steep * slopes).flatten(1, 2) * prior.scale
+        by_constant = (steep * torch.stack(turn, -1)).flatten(1, 2)
+        pull = (by_state.mT @ bent.unsqueeze(-1)).squeeze(-1) + states / prior.scale
+        push = (by_constant.mT @ bent.unsqueeze(-1)).squeeze(-1).sum(0)
+        own = by_state.mT @ by_state + torch.eye(9, dtype=torch.float64)
+        return own, by_state.mT @ by_constant, (by_constant.mT @ by_constant).sum(0), pull, push
+
     least, damping, quiet = cost(numbers, states), 1e-3, 0
     linear = None
     for _ in range(ROUNDS):
         if linear is None:
-            places, slopes = simulate_with_jacobian(
-                states, observations.times, replace_constants(initial, numbers)
-            )
-            bent, steep = cauchy((places - observations.places) / noise)
-            bent, steep = bent.nan_to_num(0.0).flatten(1), steep.nan_to_num(0.0).unsqueeze(-1) / noise
-            shifts = torch.diag(sizes / 1000)
-            turn = [(paths(numbers + shift, states) - places) / 1e-3 for shift in shifts]
-            # states are in units of the prior, constants in units of SIZES
-            by_state = (steep * slopes).flatten(1, 2) * prior.scale
-            by_constant = (steep * torch.stack(turn, -1)).flatten(1, 2)
-            pull = (by_state.mT @ bent.unsqueeze(-1)).squeeze(-1) + states / prior.scale
-            push = (by_constant.mT @ bent.unsqueeze(-1)).squeeze(-1).sum(0)
-            own = by_state.mT @ by_state + torch.eye(9, dtype=torch.float64)
-            linear = (own, by_state.mT @ by_constant, (by_constant.mT @ by_constant).sum(0), pull, push)
+            linear = linearise(numbers, states)
         push = linear[-1]
         at_bound = (numbers <= low) & (push > 0) | (numbers >= high) & (push < 0)
         state_step, step = _step(*linear, damping, at_bound)
@@ -112,7 +124,14 @@ def identify(
             damping *= 10
         if quiet == 2 or damping > 1e8:
             break
-    return numbers, states
+    own, both, whole, *_ = linearise(numbers, states) if linear is None else linear
+    information = whole - (both.mT @ torch.linalg.solve(own, both)).sum(0)
+    values, vectors = torch.linalg.eigh(information)
+    determined = values > 1e-9 * values.amax().clamp(min=1e-300)
+    variance = (
+        (vectors.square() / torch.where(determined, values, 0.0)).nan_to_num(0.0, posinf=math.inf).sum(1)
+    )
+    return numbers, states, variance.sqrt() * sizes
 
 
 def _step(

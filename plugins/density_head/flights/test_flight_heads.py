@@ -1,5 +1,6 @@
 """Tests of heads that predict flights: coverage of simulated flights, identified constants, and refusals."""
 
+import re
 from dataclasses import fields
 from typing import Literal
 
@@ -56,6 +57,49 @@ def test_constants_are_found_and_of_nonsense_stay_within_their_bounds(nonsense: 
             assert getattr(constants, name) == pytest.approx(getattr(Constants(), name), abs=near), name
     if not nonsense:
         assert head.noise.item() == pytest.approx(SIGMA, rel=0.1)
+
+
+def fit(
+    moved: torch.Tensor | None = None, order: tuple[int, ...] = (0, 1, 2), **config: object
+) -> BallisticHead:
+    """Return a head that was fitted to 24 simulated windows, whose axes are exchanged and whose origin is moved."""
+    frames, future, _ = simulate_windows(24)
+    torch.manual_seed(1)
+    future = future + SIGMA * torch.randn(future.shape)
+    offset = torch.zeros(3) if moved is None else moved
+    frames, future = frames.clone(), future[..., list(order)] + offset
+    frames[..., 1:4] = (frames[..., 1:4][..., list(order)] + offset) * frames[..., 4:]
+    target = Target("real", future_names(35, STEP))
+    head = build("density_head", resolve("density_head", {"name": "ballistic", **config}), target=target)
+    head.fit(frames.flatten(1), future.flatten(1), 0)
+    return head
+
+
+def test_constants_are_found_with_their_errors_at_any_height_of_the_table() -> None:
+    """The simulated constants lie within four standard errors, which are not too wide either."""
+    usual, moved = fit(), fit(torch.tensor([0.3, 0.0, 1.71]))
+    assert moved.constants.surface == pytest.approx(usual.constants.surface + 1.71, abs=1e-3)
+    assert moved.remark.startswith("ballistic: drag 0.1")
+    for number, name in enumerate(FITTED):
+        value, error = map(float, re.findall(rf"{name} (\S+) ± ([\d.]+)", usual.remark)[0])
+        assert value == pytest.approx(usual.found[number].item(), abs=error)
+        assert abs(value - getattr(Constants(), name)) < 4 * error, name
+        assert error < {"drag": 0.02, "lift": 1e-3, "surface": 3e-3}.get(name, 0.05), name
+
+
+@pytest.mark.parametrize(
+    "order, moved, config, message",
+    [
+        ((0, 2, 1), (0.0, 0.0, 0.0), {}, r"fall along -y.*z points up"),
+        ((0, 1, 2), (0.0, 5.0, 0.0), {}, r"bounces at y from .* Set near and far"),
+        ((0, 1, 2), (0.0, 0.0, 0.5), {"identify": False}, r"bounces at a height of -0\.4.*identify=true"),
+    ],
+)
+def test_another_frame_of_reference_is_refused(
+    order: tuple[int, ...], moved: tuple[float, ...], config: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        fit(torch.tensor(moved), order, **config)
 
 
 @pytest.mark.parametrize("density", ["linearised", "sampled"])
