@@ -59,8 +59,8 @@ def rotations_of(group: str) -> Float[Tensor, "rotation 4"]:
 
 
 def nearest_distance(
-    first: Float[Tensor, "*batch 4"], second: Float[Tensor, "*batch 4"], group: str
-) -> Float[Tensor, "*batch"]:
+    first: Float[Tensor, "... 4"], second: Float[Tensor, "... 4"], group: str
+) -> Float[Tensor, "..."]:
     """Return the smallest angle between the rotation `second` and any rotation `first` g with g in the group, radians.
 
     Batch shapes broadcast.
@@ -87,8 +87,8 @@ def noise_concentration(deviation: float) -> float:
 
 
 def log_blurred(
-    first: Float[Tensor, "*batch 4"], second: Float[Tensor, "*batch 4"], group: str, concentration: float
-) -> Float[Tensor, "*batch"]:
+    first: Float[Tensor, "... 4"], second: Float[Tensor, "... 4"], group: str, concentration: float
+) -> Float[Tensor, "..."]:
     """Return the log-density at the rotation `second` of R g N, where R is `first`, g uniform in the group, N noise.
 
     It is in nats with respect to the rotation-invariant measure of total mass 1, float64. N has the density exp(2κ cos

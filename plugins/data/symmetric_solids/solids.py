@@ -1,6 +1,7 @@
 """The solids: triangles with normals, and the group of rotations that leave each of them unchanged."""
 
 import math
+from collections.abc import Sequence
 from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -8,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from framework.geometry.solids import Point
 from framework.geometry.symmetry import GOLDEN
 
 SIDES = 96
@@ -36,7 +38,7 @@ def solid(name: str) -> ShadedSolid:
     return SOLIDS[name]()
 
 
-def _polyhedron(corners: list[tuple[float, ...]], group: str) -> ShadedSolid:
+def _polyhedron(corners: Sequence[Point], group: str) -> ShadedSolid:
     """Return the convex hull of `corners`, scaled to the unit sphere, with flat faces."""
     from scipy.spatial import ConvexHull  # this import takes a tenth of a second
 
@@ -68,7 +70,7 @@ def _icosahedron() -> ShadedSolid:
     return _polyhedron(corners, "icosahedral")
 
 
-def _round(profile: list[tuple[float, float]], group: str) -> ShadedSolid:
+def _round(profile: Sequence[tuple[float, float]], group: str) -> ShadedSolid:
     """Return the solid of revolution about z with straight sides between the (radius, height) of `profile`.
 
     Each side has vertices of its own, so that it is shaded smoothly around the axis and has sharp rims.

@@ -21,8 +21,8 @@ TERMS = (1.0, -3.0, 15.0, -105.0, 945.0, -10395.0, 135135.0)
 
 
 def log_prob(
-    angle: Float[Tensor, "*shape"], mean: Float[Tensor, "*shape 2"], factor: Float[Tensor, "*shape 2"]
-) -> Float[Tensor, "*shape"]:
+    angle: Float[Tensor, "..."], mean: Float[Tensor, "... 2"], factor: Float[Tensor, "... 2"]
+) -> Float[Tensor, "..."]:
     """Return the log-density of angles, nats, in the dtype of the parameters; shapes broadcast.
 
     Args:
