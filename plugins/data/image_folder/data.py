@@ -21,7 +21,7 @@ from framework.errors import ConfigError
 from framework.target import Target
 from plugins.data.image_folder.corruption import Corrupted, Corruption
 from plugins.data.image_folder.labelled import LabelledImages, Loaded, find_folder
-from plugins.data.image_folder.policy import Policy, vary_images
+from plugins.data.image_folder.policy import Policy, require_package, vary_images
 
 Jitter = Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)]
 
@@ -93,7 +93,7 @@ class ImageFolder(LabelledData):
         strength: Strength of the corruption, as in ImageNet-C; None: 3 if there is a corruption.
 
     Raises:
-        ConfigError: A strength is given without a corruption.
+        ConfigError: A strength is given without a corruption, or kornia, which a policy needs, is not installed.
     """
 
     bibtex = (
@@ -113,6 +113,7 @@ class ImageFolder(LabelledData):
     ) -> None:
         super().__init__(root, labelled, jitter)
         self.mirror = mirror
+        require_package(policy)
         self.policy: Policy | None = policy
         self.varies = mirror or jitter > 0 or policy is not None
         self.corruption: Corruption | None = corruption

@@ -1,13 +1,29 @@
 """Published policies that vary training images, from kornia."""
 
 from functools import cache
+from importlib.util import find_spec
 from typing import Literal
 
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
+from framework.errors import ConfigError
+
 Policy = Literal["trivial", "random"]
 """Name of a policy: one random operation for each batch (TrivialAugment), or two (RandAugment)."""
+
+
+def require_package(policy: Policy | None) -> None:
+    """Refuse a policy if kornia is not installed.
+
+    Raises:
+        ConfigError: kornia is missing.
+    """
+    if policy is not None and find_spec("kornia") is None:
+        raise ConfigError(
+            f"data.policy={policy} needs the package kornia, which is not installed. Run `pip install "
+            "'robust-visual-learning[augment]'`, or leave data.policy out."
+        )
 
 
 @cache

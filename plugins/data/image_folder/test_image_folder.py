@@ -17,9 +17,10 @@ from kornia.geometry.transform import rotate
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
+from framework.configuration.schema import build, resolve
 from framework.data import Batch, Data
 from framework.datasets.fields import fetch
-from framework.errors import DataError, UserError
+from framework.errors import ConfigError, DataError, UserError
 from framework.testing.data_samples import prepared
 from plugins.data.image_folder.corruption import CORRUPT, STRENGTHS
 from plugins.data.image_folder.data import keep_disc, turn
@@ -156,6 +157,12 @@ def test_mistakes_in_a_table_are_named(tmp_path: Path, table: str, message: str)
     (tmp_path / "labels.csv").write_text(table, encoding="utf-8")
     with pytest.raises(DataError, match=re.escape(message)):
         prepared("image_folder", **settings, **SMALL)
+
+
+def test_a_policy_without_its_package_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("plugins.data.image_folder.policy.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"needs the package kornia.*\[augment\]"):
+        build("data", resolve("data", {"name": "image_folder", "root": str(tmp_path), "policy": "trivial"}))
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
