@@ -51,7 +51,9 @@ def write_run(folder: Path, method: str, seed: int, numbers: dict[str, Any], **m
     (folder / "job.json").write_text(json.dumps(record))
     (folder / "figures" / "panels.png").write_bytes(PNG + bytes(1000))
     (folder / "figures" / "sneaky.png").write_bytes(b"<svg onload=alert(1)>")
-    (folder / "console.log").write_text("left out: 'note' (words)\nrun folder: here\n")
+    (folder / "console.log").write_text(
+        "left out: 'note' (words)\nreading: 3 of 9 files in 31 s\n   of a table  \nrun folder: here\n"
+    )
     (folder / "citations.bib").write_text("@article{one,\n  title = {One}\n}\n")
 
 
@@ -113,6 +115,14 @@ def test_a_report_on_a_sweep_has_results_differences_front_failures_and_commands
     assert row and abs(float(row[1]) - difference) < 0.01 and abs(float(row[2]) - error) < 0.01
     assert "not available" not in table and "| fast |" in table
     assert "On the front, where no other row is both better and faster: fast" in text
+
+
+def test_notes_hold_no_progress_and_a_column_of_one_data_set_is_left_out(tmp_path: Path) -> None:
+    write_sweep(tmp_path / "sweep")
+    text = write_report(tmp_path / "sweep", tmp_path)[0].read_text(encoding="utf-8")
+    assert "left out: &#x27;note&#x27; (words)" in text and "Data: moons" in text
+    assert "3 of 9 files" not in text and "of a table" not in text
+    assert "<td>moons</td>" not in text
 
 
 def test_a_page_loads_nothing_and_runs_nothing_of_a_stranger(tmp_path: Path) -> None:

@@ -190,8 +190,8 @@ def run(config: Config) -> None:
     _require_drawable(load("renderer", chosen["name"]), channels, scenes.ground)
     print_lines([f"draws {scenes.count} frames of {scenes.title} with {method}"], console)
     with open_run(config) as run:
+        console.print(f"run folder: {run.folder}", soft_wrap=True)
         if session is not None:
-            console.print(f"run folder: {run.folder}", soft_wrap=True)
             session.record(run)
             renderer = _train(session, run, chosen)
             if renderer is None:

@@ -2,6 +2,7 @@
 
 import io
 import math
+import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,6 +33,10 @@ if TYPE_CHECKING:
 LARGEST_PAGE = 9_000_000
 """Size of a page, bytes, beyond which further figures are left out, so that a browser opens it soon."""
 LARGEST_FIGURE = 4_000_000
+NO_NOTES = ("threads:", "reads ", "samples:", "draws ", "compiling functions", "features of ", " ")
+"""Beginnings of lines that a run prints before training and that are no notes; a table is indented."""
+PROGRESS = re.compile(r": \d+ of \d+ \w+ in \d+ s$")
+"""End of a line that reports progress of long work (`framework.storage.progress.Work`)."""
 NAMES = ("report.html", "report.md", "report.tex")
 
 
@@ -142,7 +147,9 @@ def _page(folder: Path, compared: Comparison, failed: Sequence[Failed], figure: 
 
 
 def _results(compared: Comparison) -> str:
-    rows, columns = compared.rows, compared.columns
+    rows, columns = compared.rows, dict(compared.columns)
+    if len({row["data"] for row in rows}) == 1:  # the introduction names the data
+        columns.pop("data", None)
     table = wide(html(rows, columns, better=compared.better))
     groups = ""
     if len(compared.runs) == 1 and isinstance(compared.runs[0].get("groups"), Mapping):
@@ -295,7 +302,7 @@ def _notes(runs: Sequence[Mapping[str, Any]]) -> str:
             continue
         lines = text.splitlines()
         first = lines[: next((i for i, line in enumerate(lines) if line.startswith("run folder:")), 0)]
-        notes = [line for line in first if not line.startswith(("threads:", "reads ", "samples:"))]
+        notes = [line for line in first if not line.startswith(NO_NOTES) and not PROGRESS.search(line)]
         notes += [line for line in lines if "warning" in line.lower()]
         for line in dict.fromkeys(notes):
             counts[line] = counts.get(line, 0) + 1
