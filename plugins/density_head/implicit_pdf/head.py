@@ -10,15 +10,14 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from framework.density_head import DensityHead
-from framework.errors import ConfigError
 from framework.geometry import quaternions
 from framework.geometry.rotation import viewpoint_rotation
 from framework.geometry.rotation_grid import centres
 from framework.heads.parameters import require_finite
+from framework.heads.rotations import require_rotation
 from framework.target import Target
 from plugins.density_head.implicit_pdf.density import VOLUME, CellDensity
 
-ANGLES = ("azimuth", "elevation", "tilt")
 Cells = Literal[72, 576, 4608, 36864, 294912]
 LARGEST_FEATURE = 30.0
 """Bound of the features that the network reads, so that it stays accurate for raw parameters of any size."""
@@ -71,13 +70,7 @@ class ImplicitPDFHead(DensityHead):
         cells: Cells = 36864,
     ) -> None:
         super().__init__()
-        target.require("angle", by="density_head implicit_pdf")
-        if target.names != ANGLES:
-            raise ConfigError(
-                f"density_head implicit_pdf describes rotations by the three angles {', '.join(ANGLES)}, in this "
-                f"order, but the targets of this data set are {target.listed_names}. Choose another density_head, or "
-                "other data; density_head=von_mises describes any angles."
-            )
+        require_rotation(target, by="implicit_pdf")
         self.frequencies = frequencies
         self.training_cells = training_cells
         self.cells = cells

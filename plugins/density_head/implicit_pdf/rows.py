@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from framework.density_head import DensityHead
 from framework.geometry.rotation_grid import cell_of, centres
+from framework.heads.rotations import ANGLES
 from framework.target import Target
 from framework.testing.rows import Case, HeadRow
-from plugins.density_head.implicit_pdf.head import ANGLES, LARGEST_FEATURE, ImplicitPDFHead
+from plugins.density_head.implicit_pdf.head import LARGEST_FEATURE, ImplicitPDFHead
 
 TARGET = Target("angle", ANGLES)
 

@@ -9,9 +9,10 @@ import torch
 from scipy import special
 
 from framework.density_head import DensityHead
+from framework.heads.rotations import ANGLES
 from framework.target import Target
 from framework.testing.rows import Case, HeadRow
-from plugins.density_head.matrix_fisher.head import ANGLES, LARGEST_PARAMETER
+from plugins.density_head.matrix_fisher.head import LARGEST_PARAMETER
 
 TARGET = Target("angle", ANGLES)
 TURN = [[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]

@@ -1,4 +1,5 @@
 import math
+from functools import partial
 
 import mpmath
 import numpy as np
@@ -13,10 +14,11 @@ from framework.errors import ConfigError
 from framework.geometry import aligned_rotations as functions
 from framework.geometry import quaternions
 from framework.geometry.rotation import viewpoint_rotation
+from framework.heads.rotations import grown_matrix
 from framework.target import Target
 from plugins.density_head.matrix_fisher import angles, quadrature
 from plugins.density_head.matrix_fisher.density import Angle, MatrixFisher
-from plugins.density_head.matrix_fisher.head import LARGEST_PARAMETER, parameter_of_raw
+from plugins.density_head.matrix_fisher.head import LARGEST_PARAMETER
 from plugins.density_head.matrix_fisher.rows import TARGET, log_constant
 
 FALLS = (0, 1e-12, 1e-3, 0.5, 3, 20, 43.9, 44.1, 300, 1e4, 1e8, 1e12, 1e16)
@@ -431,19 +433,20 @@ def test_picked_components_are_those_at_the_index():
 # ---- the head ------------------------------------------------------------------------------------------------
 
 
-def test_parameter_of_raw_is_smooth_at_zero_and_bounded():
+def test_the_grown_matrix_is_smooth_at_zero_and_bounded():
+    grow = partial(grown_matrix, largest=LARGEST_PARAMETER)
     zero = torch.zeros(3, 3).double().requires_grad_()
-    jacobian = torch.autograd.functional.jacobian(parameter_of_raw, zero)
+    jacobian = torch.autograd.functional.jacobian(grow, zero)
     torch.testing.assert_close(jacobian.reshape(9, 9), torch.eye(9).double(), rtol=0, atol=0)
     for size in (1.0, 30.0, 2e3, 3e3, 1e38, 1.7e308):
         raw = torch.full((3, 3), size, dtype=torch.float64 if size > 1e38 else torch.float32)
-        parameter = parameter_of_raw(raw)
+        parameter = grow(raw)
         assert parameter.norm() <= LARGEST_PARAMETER * (1 + 1e-12)
         norm = min(3 * size, 1e6)
         wanted = min(norm * (1 + norm**2 / 16) ** 1.5, LARGEST_PARAMETER)
         assert parameter.norm().item() == pytest.approx(wanted, rel=1e-6)
     generic = torch.randn(3, 3).double().requires_grad_()
-    assert torch.autograd.gradcheck(parameter_of_raw, generic)
+    assert torch.autograd.gradcheck(grow, generic)
 
 
 MIXED = {"name": "mixture", "components": 3, "component": {"name": "matrix_fisher"}}

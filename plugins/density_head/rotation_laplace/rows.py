@@ -8,10 +8,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from framework.density_head import DensityHead
+from framework.heads.rotations import ANGLES
 from framework.target import Target
 from framework.testing.rows import Case, HeadRow
 from plugins.density_head.rotation_laplace.functions import SOFTENING
-from plugins.density_head.rotation_laplace.head import ANGLES
 
 TARGET = Target("angle", ANGLES)
 GENERIC = [[0.5, -1.25, 0.75], [2.0, 0.125, -0.5], [0.25, 1.5, -1.0]]
