@@ -992,7 +992,13 @@ def test_a_density_over_images_shows_its_mean(kind: type) -> None:
     close(inner.variance, torch.einsum("bk,kbhwc->bhwc", share(weights), squares) - mean.square())
 
 
-CHARTS = [(name, row) for name, row in ROWS if row.target.kind == "angle" and restricted(name, row)]
+# without the rows that state a larger limit for a fixed grid, because it does not resolve their jumps or tips;
+# `mode=check` integrates these densities by draws too
+CHARTS = [
+    (name, row)
+    for name, row in ROWS
+    if row.target.kind == "angle" and "integral" not in row.limits and restricted(name, row)
+]
 
 
 @pytest.mark.parametrize("name, row", CHARTS, ids=ids(CHARTS))

@@ -41,7 +41,10 @@ from tests.conftest import Framework
 FITTED = ("ballistic", "extra_trees", "fit_pose", "lorentzian", "xgboost")
 """Heads that are fitted in one step; they are not networks."""
 REFUSED_HEADS = {
+    "implicit_pdf": "A CellDensity cannot be exported",
+    "projected_normal": "A ProjectedNormal cannot be exported",
     "quantiles": "A PiecewiseQuantiles cannot be exported",
+    "rotation_laplace": "A RotationLaplace cannot be exported",
     "lorentzian": "fitted in one step",
 }
 """Heads whose densities have no NumPy code, and one that is not a network, with words of the refusal."""
