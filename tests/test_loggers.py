@@ -3,7 +3,6 @@
 import csv
 import json
 import math
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -54,8 +53,11 @@ def journal_numbers(folder: Path) -> dict[tuple[str, int], float]:
     }
 
 
-def test_a_run_writes_the_numbers_of_its_journal_in_every_form(framework: Framework) -> None:
-    os.environ.pop("WANDB_MODE", None)
+def test_a_run_writes_the_numbers_of_its_journal_in_every_form(
+    framework: Framework, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("WANDB_MODE", "WANDB_DIR"):
+        monkeypatch.delenv(name, raising=False)
     done = framework(*TINY, "logger=[csv,tensorboard,wandb]")
     assert done.code == 0, done.out
     wanted = journal_numbers(done.folder)
@@ -82,7 +84,11 @@ def test_a_run_writes_the_numbers_of_its_journal_in_every_form(framework: Framew
     for name in events.Tags()["scalars"]:
         for event in events.Scalars(name):
             assert event.value == pytest.approx(wanted[name, event.step], rel=1e-6, nan_ok=True)
-    assert list((done.folder / "wandb").glob("offline-run-*")), "nothing is sent"
+    (offline,) = (tmp_path / "outputs" / "wandb").glob("offline-run-*")  # nothing is sent
+    assert list(offline.glob("*.wandb")) and "Copy stopped" not in done.out
+    assert not any(path.is_symlink() for path in done.folder.rglob("*")), (
+        "commands would refuse the run folder"
+    )
 
 
 class Broken(Copy):

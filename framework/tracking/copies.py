@@ -135,7 +135,10 @@ class TensorBoardCopy(Copy):
 
 @final
 class WandbCopy(Copy):
-    """Run of Weights & Biases in the folder `wandb`, offline unless the user sets WANDB_MODE."""
+    """Run of Weights & Biases in `outputs/wandb`, offline unless the user sets WANDB_MODE.
+
+    The files are not in the run folder, because wandb writes links, which commands that read a run folder refuse.
+    """
 
     _run: Any = None
     _last = 0
@@ -145,8 +148,10 @@ class WandbCopy(Copy):
             os.environ.setdefault("WANDB_MODE", "offline")
             os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
             wandb = importlib.import_module("wandb")
+            folder = Path(os.environ.get("WANDB_DIR", "outputs"))
+            folder.mkdir(parents=True, exist_ok=True)
             self._run = wandb.init(
-                dir=str(self.folder),
+                dir=str(folder),
                 project=self.project,
                 name=self.name,
                 id=hashlib.sha256(str(self.folder.absolute()).encode()).hexdigest()[:16],
@@ -170,7 +175,7 @@ class WandbCopy(Copy):
 
     def close(self, status: Status, journal: Journal) -> None:
         if self._run is not None:
-            self._run.finish(exit_code=0 if status == "FINISHED" else 1, quiet=True)
+            self._run.finish(exit_code=0 if status == "FINISHED" else 1)
             self._run = None
 
 
