@@ -9,7 +9,8 @@ _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #222; max-width: 75rem; margin: 0 auto; padding: 0 1rem 4rem }
 h1 { line-height: 1.2; overflow-wrap: anywhere } h2 { margin-top: 2.5rem; border-bottom: 1px solid #ccc }
 .wide { overflow-x: auto } table { border-collapse: collapse; margin: 1rem 0; font-size: .9rem }
-caption { caption-side: bottom; text-align: left; color: #555; padding-top: .3rem }
+caption { caption-side: bottom; text-align: left; color: #555; padding-top: .3rem;
+  position: sticky; left: 0; max-width: min(calc(100vw - 2rem), 73rem) }
 th, td { padding: .25rem .7rem; text-align: right; white-space: nowrap; border-bottom: 1px solid #ddd }
 th { cursor: pointer; border-bottom: 2px solid #888; vertical-align: bottom }
 th:first-child, td:first-child { text-align: left; position: sticky; left: 0; background: #fff } b { color: #005a9c }
