@@ -19,6 +19,8 @@ CHART = ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2), (-math.pi, math.pi))
 """Ranges of azimuth, elevation and tilt, radians."""
 BINS = 360
 """Number of bins of the density of a single angle."""
+FEW = 4608
+"""Largest number of cells for which a matrix holds the share of each cell in each arc."""
 POINTS = 2**20
 """Least number of points in all cells from which the density of a single angle is computed; at least 64 in each."""
 
@@ -158,13 +160,22 @@ def _arcs(cells: int, index: int) -> Int[Tensor, "point cell"]:
     g + 1, modulo 1 (a Kronecker sequence; Niederreiter 1992, §3.1).
     """
     count = max(POINTS // cells, 64)
-    number = torch.arange(cells)
     root = 1.2207440846057596
-    arcs = []
-    for point in range(count):
-        x, y, along = ((number * count + point + 0.5).double() / root**power % 1 for power in (1, 2, 3))
-        arcs.append(_arc(points_in(number, x, y, along, cells)[:, index], index == 1).to(torch.int16))
-    return torch.stack(arcs)
+    parts = []
+    for number in torch.arange(cells * count).split(2**20):
+        x, y, along = ((number + 0.5).double() / root**power % 1 for power in (1, 2, 3))
+        points = points_in(number // count, x, y, along, cells)
+        parts.append(_arc(points[:, index], index == 1).to(torch.int16))
+    return torch.cat(parts).reshape(cells, count).T.contiguous()
+
+
+@cache
+def _shares(cells: int, index: int) -> Float[Tensor, "cell arc"]:
+    """Return the share of each cell that lies in each arc, for a grid of few cells."""
+    arcs = _arcs(cells, index).long()
+    place = torch.arange(cells) * BINS + arcs
+    count = torch.bincount(place.flatten(), minlength=cells * BINS)
+    return count.reshape(cells, BINS).double() / len(arcs)
 
 
 estimate.register(CellDensity, exact_estimate)
@@ -174,11 +185,15 @@ estimate.register(AngleDensity, exact_estimate)
 @marginal.register
 def _(density: CellDensity, index: int) -> AngleDensity:
     weights = density.log_weights.detach().reshape(-1, density.cells).double().exp()
-    arcs = _arcs(density.cells, index)
-    mass = weights.new_zeros(len(weights), BINS)
-    for arc in arcs:
-        mass.index_add_(1, arc.to(weights.device, torch.int64), weights)
-    mass = (mass / len(arcs)).reshape(*density.batch_shape, BINS)
+    if density.cells <= FEW:
+        mass = weights @ _shares(density.cells, index).to(weights)
+    else:
+        arcs = _arcs(density.cells, index)
+        mass = weights.new_zeros(len(weights), BINS)
+        for arc in arcs:
+            mass.index_add_(1, arc.to(weights.device, torch.int64), weights)
+        mass = mass / len(arcs)
+    mass = mass.reshape(*density.batch_shape, BINS)
     length = (math.pi if index == 1 else 2 * math.pi) / BINS
     return AngleDensity((mass / length).log().to(density.log_weights.dtype), index == 1)
 
