@@ -312,7 +312,8 @@ true one, degrees. That of the exact density is not 0, because labels are noisy.
 
 *Densities for one test image of each solid (synthetic, first seed). A dot is a rotation: its place is elevation and
 tilt on a map of the sphere (Mollweide), its colour the azimuth, and its area the density. A peak of a polyhedron's
-exact density holds dots of several colours, because several equivalent rotations differ in the azimuth alone.*
+exact density holds dots of several colours, because several equivalent rotations differ in the azimuth alone.
+Densities below 3 % of the highest exact density are not drawn, so that a panel of a nearly uniform density is empty.*
 
 {machine("torch", "numpy")}
 Commands: `python -m benchmarks.pose.symmetric_solids train`, then `python -m benchmarks.pose.symmetric_solids page`.
