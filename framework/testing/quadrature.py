@@ -10,7 +10,7 @@ from torch.distributions import Distribution
 
 from framework.distributions.circular import Circular
 
-POINTS = {1: 1020, 2: 252, 3: 60}
+POINTS = {1: 1020, 2: 504, 3: 60}
 """Grid points per side, by the number of angles; the error is negligible for densities that the grid resolves."""
 REAL_POINTS = {1: 1020, 2: 252, 3: 72}
 """Grid points per side, by the number of real numbers."""
