@@ -470,7 +470,4 @@ ALL_FAULTS = (
     Fault("samples chosen on the CPU", "on the device of its inputs", {"augment": left_in_place}),
     Fault("varied by NumPy", "on the device of its inputs", {"augment": by_numpy}),
     Fault("64 of a batch are varied", "augment", {"augment": varied_to_64}),
-    Fault(
-        "batches are called varied and stay as they are", "augment", {"augment": lambda self, batch: batch}
-    ),
 )

@@ -108,7 +108,7 @@ def test_parts_of_something_else_are_not_added_to(root, tmp_path, change):
 def test_what_cannot_be_encoded_is_refused(root, tmp_path):
     with pytest.raises(ConfigError, match="would be read as files"):
         require_apart(root, root / "a" / "features")
-    with pytest.raises(DataError, match="no folder with files"):
+    with pytest.raises(DataError, match="is not a folder with files"):
         collect_files(tmp_path / "nowhere")
     with pytest.raises(ConfigError, match=r"no job 3 of 2\. Use 1/2 to 2/2"):
         parts_of_job(6, "3/2")

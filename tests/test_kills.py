@@ -165,6 +165,7 @@ END_BY_THEMSELVES = {
     "watch.py": "when the run's process has ended",
     "store_process.py": "with their input",
     "repository.py": "within seconds, in which they read one commit",
+    "pictures.py": "with their input",
     "slurm.py": "within seconds, in which SLURM answers",
 }
 """Files that start other processes, and when those end."""

@@ -33,6 +33,9 @@ CHAINS = {
     "ensemble": "[ensemble,conformal]",
     "platt": "[platt,conformal]",
     "folds": "[folds,conformal]",
+    "laplace": "[laplace,conformal]",
+    "swag": "[swag,conformal]",
+    "batch_ensemble": "[batch_ensemble,conformal]",
 }
 """Wrappers, each inside the wrapper for conformal prediction sets."""
 ELSEWHERE = {"refined"}
@@ -45,9 +48,14 @@ OFTEN = {
     "ensemble": ("class",),
     "platt": ("class",),
     "folds": ("real",),
+    "laplace": ("degrees",),
+    "swag": ("real",),
+    "batch_ensemble": ("class",),
 }
 """Kinds of targets that are always tested for each wrapper; the other kinds are slow tests."""
 SHORT = {
+    "batch_ensemble": ("uncertainty.batch_ensemble.members=2",),
+    "swag": ("trainer.keep=last", "trainer.patience=null"),
     "ensemble": ("uncertainty.ensemble.members=2",),
     "mc_dropout": ("uncertainty.mc_dropout.samples=5",),
     "folds": ("uncertainty.folds.folds=2", "uncertainty.folds.steps=60", "uncertainty.folds.epochs=2"),
@@ -93,7 +101,7 @@ def trained(framework: Framework, table: Path, kind: str, chain: str) -> Done:
 
 def drawn(kind: str, wrapper: str) -> bool:
     """Return whether sizes are volumes that are estimated from draws: those of mixtures of several numbers."""
-    return kind == "several reals" and wrapper in ("mc_dropout", "ensemble", "folds")
+    return kind == "several reals" and wrapper not in ("conformal", "temperature", "platt")
 
 
 def test_every_wrapper_is_asked() -> None:
@@ -156,7 +164,9 @@ def test_a_set_is_the_same_wherever_it_is_said(
             error = sets.size_error().numpy()  # type: ignore[attr-defined]
             assert (np.abs(found - sizes) < 6 * math.sqrt(2) * error).all()
         else:
-            np.testing.assert_allclose(found, sizes, rtol=1e-5, atol=1e-6)
+            # the validation row that sets the threshold lies on it, so that rounding decides about its class
+            apart = ~np.isclose(found, sizes, rtol=1e-5, atol=1e-6)
+            assert apart.sum() <= (kind == "class"), (found[apart], sizes[apart])
 
     # an interval of another mass promises nothing
     with pytest.raises(ConfigError, match=r"this model predicts sets"):

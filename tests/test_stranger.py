@@ -84,4 +84,4 @@ def test_packages_that_clash_or_are_damaged_break_only_what_is_theirs(
         refused = framework(*TINY, "logger=none", f"density_head={chosen}", folder=chosen, **here)
         assert refused.code == 2, refused.out
         assert wanted in refused.out and "Traceback" not in refused.out
-        assert refused.out.count("\n") == 1, refused.out
+        assert refused.out.count("\n") == 2 and "\nhelp:  docs/" in refused.out, refused.out

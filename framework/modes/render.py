@@ -24,6 +24,7 @@ from framework.configuration.paths import paths_of
 from framework.configuration.registry import installed, load
 from framework.configuration.schema import build, resolve
 from framework.data import Data
+from framework.datasets.images import open_image
 from framework.datasets.png import encode_png
 from framework.errors import ConfigError, did_you_mean
 from framework.evaluation.rendering import Frame, Ground, Painter, evaluate_frames, frame_cost
@@ -488,8 +489,12 @@ def _write_animations(folder: Path, frames: FileFrames) -> None:
     for first in range(0, len(frames), frames.count):
         files = [folder / f"{name}.png" for name in frames.names[first : first + frames.count]]
         if files[0].is_file():
-            pictures = (np.asarray(Image.open(file)) for file in files)
-            write_frames(folder / f"{files[0].stem.rpartition('_')[0]}.gif", pictures, RATE)
+            write_frames(folder / f"{files[0].stem.rpartition('_')[0]}.gif", map(_read_frame, files), RATE)
+
+
+def _read_frame(file: Path) -> np.ndarray:
+    with open_image(file) as image:
+        return np.asarray(image)
 
 
 def _write_images(folder: Path, name: str, channels: Mapping[str, Tensor]) -> None:
