@@ -154,7 +154,7 @@ experiment=moons/vanilla_128 hydra.run.dir=/proc/self/x | /proc/self/x cannot be
 experiment=moons/vanilla_128 hydra.run.dir=/dev/null/x | /dev/null/x cannot be written
 mode=test checkpoint=last | no run in that folder has a checkpoint
 experiment=moons/vanilla_128 checkpoint=last | no run in that folder has a checkpoint
-encoder=[resnet50] | 'encoder/resnet50'. Available in encoder
+encoder=[resnet50] | 'encoder/resnet50'. Did you mean 'resnet'? Available in encoder
 density_head=regression | 'density_head/regression'. Available in density_head
 density_head=pit | 'density_head/pit'. Available in density_head
 encoder=[transformer] | 'encoder/transformer'. Available in encoder
