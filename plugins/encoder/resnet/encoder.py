@@ -1,6 +1,6 @@
 """Residual networks up to their global average pooling."""
 
-from typing import Literal, Self
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -99,9 +99,10 @@ class ResNet(Encoder):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
-    def train(self, mode: bool = True) -> Self:
+    def train(self, mode: bool = True) -> "ResNet":
         """Set training mode, except in a frozen network, whose batch norm always uses the stored numbers."""
-        return super().train(mode and not self.fixed)
+        super().train(mode and not self.fixed)
+        return self
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch features"]:
         """Return the features of the images."""
