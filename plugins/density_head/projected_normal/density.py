@@ -1,6 +1,7 @@
 """Independent projected normal angles as a torch distribution."""
 
 import math
+from typing import no_type_check
 
 import torch
 from jaxtyping import Float
@@ -52,6 +53,7 @@ class ProjectedNormal(Distribution):
     def log_prob(self, value: Tensor) -> Tensor:
         return self._of_each(value).sum(-1).to(self.dtype)
 
+    @no_type_check
     def _of_each(self, value: Tensor) -> Tensor:
         """Return the log-density of each angle, float64."""
         return functions.log_prob(value.double(), self.mean_vector.double(), self.factor.double())
@@ -95,6 +97,7 @@ class ProjectedNormal(Distribution):
         reach[2] = (4 * norm / torch.hypot(x, y).clamp(min=1e-300)).clamp(max=2 * math.pi / POINTS)
         return wrap(self._highest(start - reach, start + reach))
 
+    @no_type_check
     def _highest(self, low: Tensor, high: Tensor) -> Tensor:
         """Return the maximum between `low` and `high` by golden-section search (Kiefer 1953)."""
         ratio = (math.sqrt(5) - 1) / 2
