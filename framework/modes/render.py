@@ -189,7 +189,8 @@ def run(config: Config) -> None:
     channels = tuple(dict.fromkeys([*options.channels, *sorted(reads)]))
     # what the renderer cannot draw is said before a training
     _require_drawable(load("renderer", chosen["name"]), channels, scenes.ground)
-    print_lines([f"draws {scenes.count} frames of {scenes.title} with {method}"], console)
+    frames = "frame" if scenes.count == 1 else "frames"
+    print_lines([f"draws {scenes.count} {frames} of {scenes.title} with {method}"], console)
     with open_run(config) as run:
         console.print(f"run folder: {run.folder}", soft_wrap=True)
         if session is not None:
