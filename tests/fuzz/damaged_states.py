@@ -39,8 +39,8 @@ SEED = 17
 CLASSES = Target("class", ("a", "b"))
 HEADS = {"class": "categorical", "real": "gaussian", "angle": "von_mises"}
 SMALL = {"name": "mlp", "widths": [4], "dropout": 0.1}
-HEAVY = {"inception_resnet_v2"}
-"""Plugins with networks of 200 MB, whose weights are read by the same code as those of other networks."""
+HEAVY = {"inception_resnet_v2", "resnet"}
+"""Plugins with networks of 40 MB and more, whose weights are read by the same code as those of other networks."""
 OURS: set[str] = set()
 """Paths in the configs of the rows."""
 TOLD = "fuzz"

@@ -161,8 +161,8 @@ has.
   damaged type, shape or structure was accepted.
 
 In the rows "arrays of …", one array in the checkpoint of a model with that plugin is damaged. The model is then
-loaded and predicts. All plugins that store arrays are included, except `inception_resnet_v2` (218 MB), whose weights
-are read by the same code as other networks.
+loaded and predicts. All plugins that store arrays are included, except `inception_resnet_v2` (218 MB) and `resnet` (45
+MB), whose weights are read by the same code as other networks.
 
 {table}
 

@@ -114,21 +114,28 @@ def place_errors(parameters, wanted):
 @pytest.mark.slow
 @pytest.mark.parametrize("gradient", ["boundary", "nmr", "soft"])
 def test_a_small_offset_is_found_again(body_model, gradient):
-    """Check that every gradient reduces the error, and that the exact one finds the original parameters."""
+    """Check that every gradient halves the error, and that the exact one explains the image as the true parameters do.
+
+    In 48 × 40 pixels the body's own turn hides a rotation of a degree, so that the true parameters are not the only
+    ones that explain the image.
+    """
     camera = body_model.camera(**SIZE)
     wanted = torch.zeros(len(body_model.names), dtype=torch.float64)
     wanted[:6] = torch.tensor([0.05, 0.15, -0.1, 0.05, -0.04, 0.06])
     picture = renderer(supersampling=8)(scene_of(body_model, wanted, camera))["color"]
     drawing = renderer(gradient=gradient)
-    fit = Descent(body_model, drawing, camera, steps=20, restarts=0, enough=1e-3)(picture)
+    descent = Descent(body_model, drawing, camera, steps=20, restarts=0, enough=1e-3)
+    fit = descent(picture)
     degrees, centimetres = place_errors(fit.parameters, wanted)
     start = place_errors(wanted * 0, wanted)
     assert degrees < start[0] / 2 and centimetres < start[1] / 2
     if gradient == "boundary":
-        assert degrees < 1 and centimetres < 1
+        assert centimetres < 1
+        last = STAGES[-1]
+        loss = descent._loss(wanted, last, camera, blur(picture, last.blur))[0]
+        assert fit.difference < 1.1 * (loss / picture.numel()) ** 0.5
     assert fit.path.shape[1] == 2 + len(body_model.names) and fit.path.isfinite().all()
-    again = Descent(body_model, drawing, camera, steps=20, restarts=0, enough=1e-3)(picture)
-    assert torch.equal(again.parameters, fit.parameters)
+    assert torch.equal(descent(picture).parameters, fit.parameters)
 
 
 def test_the_density_knows_how_far_off_it_is(doll_images):

@@ -11,12 +11,10 @@ from torch.distributions import Distribution, constraints
 from framework.distributions.circular import Circular, circular, wrap
 from framework.distributions.description import one_line
 from framework.distributions.protocol import estimate, exact_estimate, marginal, pick, tempered_density
+from framework.distributions.uniform import uniform
 from framework.geometry.rotation_grid import cell_of, centres, mean_log_cosine, points_in
+from framework.heads.viewpoints import CHART, VOLUME, UniformViewpoints, ViewpointDensity, log_volume
 
-VOLUME = 8 * math.pi**2
-"""Volume of all rotations in the coordinates azimuth a, elevation e and tilt t, ∫ cos e da de dt."""
-CHART = ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2), (-math.pi, math.pi))
-"""Ranges of azimuth, elevation and tilt, radians."""
 BINS = 360
 """Number of bins of the density of a single angle."""
 FEW = 4608
@@ -25,7 +23,7 @@ POINTS = 2**20
 """Least number of points in all cells from which the density of a single angle is computed; at least 64 in each."""
 
 
-class CellDensity(Distribution):
+class CellDensity(ViewpointDensity):
     """Azimuth a, elevation e and tilt t of a rotation whose density is constant in each cell of a grid.
 
     The cells are those of `framework.geometry.rotation_grid` and have equal volumes. With n cells and the probability w
@@ -37,18 +35,10 @@ class CellDensity(Distribution):
         log_weights: log of the probability of each cell, (*batch, cell), nats.
     """
 
-    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
-    has_rsample = False
-    __repr__ = one_line
-
     def __init__(self, log_weights: Float[Tensor, "*batch cell"]) -> None:
         self.log_weights = log_weights
         self.cells = log_weights.shape[-1]
-        super().__init__(log_weights.shape[:-1], torch.Size((3,)), validate_args=False)
-
-    @property
-    def support(self) -> constraints.Constraint:
-        return Circular(CHART)
+        super().__init__(log_weights.shape[:-1], log_weights.dtype)
 
     @property
     def mode(self) -> Float[Tensor, "*batch 3"]:
@@ -61,10 +51,8 @@ class CellDensity(Distribution):
         shape = torch.broadcast_shapes(index.shape, self.batch_shape)
         weights = self.log_weights.expand(*shape, self.cells)
         log_weight = weights.gather(-1, index.expand(shape).unsqueeze(-1)).squeeze(-1)
-        cosine = torch.log(torch.cos(value[..., 1].double()).abs())
-        return (log_weight.double() + math.log(self.cells) + cosine - math.log(VOLUME)).to(
-            self.log_weights.dtype
-        )
+        volume = log_volume(value[..., 1].double())
+        return (log_weight.double() + math.log(self.cells) + volume).to(self.dtype)
 
     @torch.no_grad()
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
@@ -180,6 +168,11 @@ def _shares(cells: int, index: int) -> Float[Tensor, "cell arc"]:
 
 estimate.register(CellDensity, exact_estimate)
 estimate.register(AngleDensity, exact_estimate)
+
+
+@uniform.register
+def _(density: CellDensity) -> UniformViewpoints:
+    return UniformViewpoints(density.log_weights.new_zeros(()), density.batch_shape)
 
 
 @marginal.register

@@ -15,8 +15,9 @@ from framework.geometry.rotation import viewpoint_rotation
 from framework.geometry.rotation_grid import centres
 from framework.heads.parameters import require_finite
 from framework.heads.rotations import require_rotation
+from framework.heads.viewpoints import log_volume
 from framework.target import Target
-from plugins.density_head.implicit_pdf.density import VOLUME, CellDensity
+from plugins.density_head.implicit_pdf.density import CellDensity
 
 Cells = Literal[72, 576, 4608, 36864, 294912]
 LARGEST_FEATURE = 30.0
@@ -99,7 +100,7 @@ class ImplicitPDFHead(DensityHead):
         at_others = self._log_density(raw.unsqueeze(-2), self.of_rotation(others))
         at_label = self._log_density(raw, self.of_rotation(self._encode(target)))
         total = torch.logsumexp(torch.cat([at_label.unsqueeze(-1), at_others], -1), -1)
-        volume = torch.log(torch.cos(target[..., 1].double()).abs()) - math.log(VOLUME)
+        volume = log_volume(target[..., 1].double())
         return total - at_label - math.log(self.training_cells + 1) - volume.to(raw.dtype)
 
     def _encode(self, angles: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape numbers"]:

@@ -10,8 +10,9 @@ from framework.errors import ConfigError
 from framework.geometry import quaternions
 from framework.geometry.rotation_grid import centres
 from framework.geometry.symmetry import draw_members, draw_noise, log_blurred, noise_concentration
+from framework.heads.viewpoints import VOLUME
 from framework.target import Target
-from plugins.density_head.implicit_pdf.density import VOLUME, CellDensity
+from plugins.density_head.implicit_pdf.density import CellDensity
 from plugins.density_head.implicit_pdf.rows import COARSE, TARGET
 
 

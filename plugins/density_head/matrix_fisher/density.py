@@ -1,33 +1,20 @@
-"""The matrix Fisher density of a viewpoint as a torch distribution, and the densities of its single angles."""
+"""The matrix Fisher density of a viewpoint as a torch distribution."""
 
-import math
-from collections.abc import Callable
 from functools import cached_property
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.distributions import Distribution, constraints
 
-from framework.distributions.circular import Circular, grid
-from framework.distributions.description import one_line
 from framework.distributions.exported import Exported, exported
-from framework.distributions.panels import entropy_of_one
 from framework.distributions.protocol import estimate, exact_estimate, marginal, pick, take, tempered_density
 from framework.distributions.uniform import uniform
 from framework.geometry import aligned_rotations as functions
 from framework.geometry import quaternions
-from plugins.density_head.matrix_fisher import angles, quadrature
-
-VOLUME = 8 * math.pi**2
-"""Volume of all rotations in the coordinates azimuth a, elevation e and tilt t (CHART), ∫ cos e da de dt."""
-CHART = ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2), (-math.pi, math.pi))
-"""Ranges of azimuth, elevation and tilt, radians."""
-SUMMITS = 6
-"""Number of maxima on a grid, the highest ones, near which the mode of one angle's density is searched."""
+from framework.heads.viewpoints import Angle, ViewpointDensity, log_volume
 
 
-class MatrixFisher(Distribution):
+class MatrixFisher(ViewpointDensity):
     """Azimuth a, elevation e and tilt t of a rotation R with density exp(tr(FᵀR)) / c(F) (Downs 1972).
 
     R is framework.geometry.rotation.viewpoint_rotation(a, e, t). Every rotation has one viewpoint in the chart
@@ -49,18 +36,9 @@ class MatrixFisher(Distribution):
         dtype: dtype of all results; by default the dtype of the parameter. All computations are in float64.
     """
 
-    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
-    has_rsample = False
-    __repr__ = one_line
-
     def __init__(self, parameter: Float[Tensor, "*batch 3 3"], dtype: torch.dtype | None = None) -> None:
         self.parameter = parameter
-        self.dtype = dtype or parameter.dtype
-        super().__init__(parameter.shape[:-2], torch.Size((3,)), validate_args=False)
-
-    @property
-    def support(self) -> constraints.Constraint:
-        return Circular(CHART)
+        super().__init__(parameter.shape[:-2], dtype or parameter.dtype)
 
     @cached_property
     def frame(self) -> functions.Frame:
@@ -83,7 +61,7 @@ class MatrixFisher(Distribution):
     def log_prob(self, value: Float[Tensor, "... 3"]) -> Float[Tensor, "..."]:
         exact = value.double()
         of_rotation = functions.log_prob(quaternions.of_viewpoint(exact), self.parameter)
-        return (of_rotation + _log_volume(exact[..., 1])).to(self.dtype)
+        return (of_rotation + log_volume(exact[..., 1])).to(self.dtype)
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         shape = torch.Size(sample_shape) + self.batch_shape + self.event_shape
@@ -95,88 +73,17 @@ class MatrixFisher(Distribution):
 
         It is the entropy of the rotation in closed form, minus E log(cos e / 8π²) by quadrature.
         """
-        elevation = Angle(self, 1)
-        log_volume = elevation.expectation(_log_volume)
-        return (functions.entropy(self.frame.falls) - log_volume).to(self.dtype)
-
-
-class Angle(Distribution):
-    """The density of one angle of a matrix Fisher density; without gradients.
-
-    The integral over a second angle is a Bessel function. The integral over the third angle is computed by quadrature
-    with nodes around the peaks (at most two for most F), from the uniform density to concentrations of 1e12. Elevations
-    outside the chart are read as the equivalent elevations inside.
-
-    Args:
-        joint: the density of all three angles.
-        index: 0 for azimuth, 1 for elevation, 2 for tilt.
-    """
-
-    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
-    has_rsample = False
-    __repr__ = one_line
-
-    def __init__(self, joint: MatrixFisher, index: int) -> None:
-        self.joint = joint
-        self.index = index
-        super().__init__(joint.batch_shape, torch.Size((1,)), validate_args=False)
-
-    @property
-    def support(self) -> constraints.Constraint:
-        return Circular((CHART[self.index],))
-
-    def log_prob(self, value: Float[Tensor, "... 1"]) -> Float[Tensor, "..."]:
-        log_prob = angles.log_marginal(value.double().squeeze(-1), self.joint.frame, self.index)
-        return log_prob.to(self.joint.dtype)
-
-    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
-        return self.joint.sample(sample_shape)[..., self.index : self.index + 1]
-
-    @property
-    def mode(self) -> Float[Tensor, "*batch 1"]:
-        """Angle of the highest density, radians, (*batch, 1).
-
-        It is the highest of the peaks near the SUMMITS maxima on a grid and near this angle of the joint mode.
-        """
-        points = 90
-        around = grid(points, dtype=torch.float64, device=self.joint.parameter.device)
-        step = 2 * math.pi / points
-        if self.index == 1:
-            around, step = around / 2, step / 2
-        height = self._log_density(around.expand(*self.batch_shape, points))
-        lower = torch.maximum(height.roll(1, -1), height.roll(-1, -1))
-        summits = height.where(height >= lower, -math.inf).topk(SUMMITS).indices
-        starts = torch.cat([around[summits], self.joint.mode.double()[..., self.index, None]], -1)
-        highest = quadrature.maximum(self._log_density, starts, step)
-        return highest.unsqueeze(-1).to(self.joint.dtype)
-
-    def entropy(self) -> Tensor:
-        """Return the entropy, nats, by quadrature."""
-        return entropy_of_one(self)
-
-    def expectation(self, function: Callable[[Tensor], Tensor]) -> Float[Tensor, "*batch"]:
-        """Return E function(angle), float64; `function` maps radians (*batch, point) to values (*batch, point)."""
-        most = math.pi / 2 if self.index == 1 else math.pi
-        like = self.joint.frame.falls[..., 0]
-        points, weights = quadrature.nodes(self._log_density, -most, most, like, periodic=self.index != 1)
-        mass = weights * self._log_density(points).exp()
-        return (mass * function(points)).sum(-1) / mass.sum(-1)
-
-    def _log_density(self, points: Float[Tensor, "*batch point"]) -> Float[Tensor, "*batch point"]:
-        return angles.log_marginal(points.movedim(-1, 0), self.joint.frame, self.index).movedim(0, -1)
-
-
-def _log_volume(elevation: Tensor) -> Tensor:
-    return torch.log(torch.cos(elevation).abs()) - math.log(VOLUME)
+        elevation = Angle(self, 1, self.frame)
+        mean_log_volume = elevation.expectation(log_volume)
+        return (functions.entropy(self.frame.falls) - mean_log_volume).to(self.dtype)
 
 
 estimate.register(MatrixFisher, exact_estimate)
-estimate.register(Angle, exact_estimate)  # quadrature uses no random samples
 
 
 @marginal.register
 def _(density: MatrixFisher, index: int) -> Angle:
-    return Angle(density, index)
+    return Angle(density, index, density.frame)
 
 
 @exported.register
@@ -189,11 +96,6 @@ def _(density: MatrixFisher) -> Exported:
 def _(density: MatrixFisher) -> MatrixFisher:
     """Return the uniform density of rotations, Haar's measure, which is cos e / 8π² on the chart."""
     return MatrixFisher(torch.zeros_like(density.parameter), density.dtype)
-
-
-@uniform.register
-def _(density: Angle) -> Angle:
-    return Angle(uniform(density.joint), density.index)  # pyright: ignore[reportArgumentType]
 
 
 @pick.register

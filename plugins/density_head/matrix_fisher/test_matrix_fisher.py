@@ -14,10 +14,11 @@ from framework.errors import ConfigError
 from framework.geometry import aligned_rotations as functions
 from framework.geometry import quaternions
 from framework.geometry.rotation import viewpoint_rotation
+from framework.heads import angle_marginals, peak_quadrature
 from framework.heads.rotations import grown_matrix
+from framework.heads.viewpoints import Angle
 from framework.target import Target
-from plugins.density_head.matrix_fisher import angles, quadrature
-from plugins.density_head.matrix_fisher.density import Angle, MatrixFisher
+from plugins.density_head.matrix_fisher.density import MatrixFisher
 from plugins.density_head.matrix_fisher.head import LARGEST_PARAMETER
 from plugins.density_head.matrix_fisher.rows import TARGET, log_constant
 
@@ -268,7 +269,7 @@ def test_the_mode_of_an_angle_is_its_highest_place(concentration):
     parameters = [left @ torch.diag(concentration * double(shape)) @ right.T for shape in shapes]
     density = MatrixFisher(torch.stack(parameters))
     for index, most in enumerate((math.pi, math.pi / 2, math.pi)):
-        alone = Angle(density, index)
+        alone = Angle(density, index, density.frame)
         count = 801 if concentration > 1e3 else 201
         grid = torch.linspace(-most, most, count).double()
         coarse = alone.log_prob(grid[:, None, None].expand(-1, len(shapes), 1))
@@ -284,8 +285,8 @@ def test_marginals_of_ridges_and_flat_directions_integrate_to_one(concentration,
     left, right = random_rotations(2, seed=3)
     density = MatrixFisher(left @ torch.diag(concentration * double(shape)) @ right.T)
     for index, most in enumerate((math.pi, math.pi / 2, math.pi)):
-        alone = Angle(density, index)
-        points, weights = quadrature.nodes(
+        alone = Angle(density, index, density.frame)
+        points, weights = peak_quadrature.nodes(
             lambda angle, alone=alone: alone.log_prob(angle[:, None]),
             -most,
             most,
@@ -299,13 +300,13 @@ def test_marginals_of_ridges_and_flat_directions_integrate_to_one(concentration,
     "index, count",
     [
         pytest.param(index, count, marks=() if place % 3 == index else pytest.mark.slow)
-        for place, count in enumerate(angles.FEW)
+        for place, count in enumerate(angle_marginals.FEW)
         for index in range(3)
     ],
 )
 def test_few_nodes_do_up_to_their_bound(index, count, monkeypatch):
     """Check the bound itself, for peaks, ridges and flat directions, wherever they lie and far from them too."""
-    bound = angles.FEW[count]
+    bound = angle_marginals.FEW[count]
     falls = double([[1, 1, 1], [0.5, 1, 1], [0.01, 1, 1], [0.4, 0.6, 1], [0, 1, 1]]) * bound * (1 - 1e-9)
     shapes = torch.diag_embed(falls.sum(-1, keepdim=True) / 4 - falls / 2)
     rotations = torch.stack([random_rotations(len(shapes), seed) for seed in range(9)])
@@ -314,7 +315,7 @@ def test_few_nodes_do_up_to_their_bound(index, count, monkeypatch):
     reach = math.pi / 2 - 0.02 if index == 1 else math.pi
     places = torch.linspace(-reach, reach, 31).double()[:, None, None, None].expand(-1, 9, len(shapes), 1)
     log_prob = marginal(density, index).log_prob(places)
-    monkeypatch.setattr(angles, "FEW", {1500: 1e9})
+    monkeypatch.setattr(angle_marginals, "FEW", {1500: 1e9})
     torch.testing.assert_close(log_prob, marginal(density, index).log_prob(places), rtol=0, atol=5e-12)
 
 

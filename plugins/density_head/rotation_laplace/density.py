@@ -1,28 +1,21 @@
 """The rotation Laplace density of a viewpoint as a torch distribution."""
 
-import math
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.distributions import Categorical, Distribution, constraints
+from torch.distributions import Categorical
 
-from framework.distributions.circular import Circular
-from framework.distributions.description import one_line
-from framework.distributions.protocol import estimate, exact_estimate, pick, take
+from framework.distributions.protocol import estimate, exact_estimate, marginal, pick, take
 from framework.distributions.uniform import uniform
 from framework.geometry import aligned_rotations, quaternions
+from framework.heads.viewpoints import Angle, UniformViewpoints, ViewpointDensity, log_volume
 from plugins.density_head.rotation_laplace import functions
 
-VOLUME = 8 * math.pi**2
-"""Volume of all rotations in the coordinates azimuth a, elevation e and tilt t (CHART), ∫ cos e da de dt."""
-CHART = ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2), (-math.pi, math.pi))
-"""Ranges of azimuth, elevation and tilt, radians."""
 DRAWS = 2000
 """Number of draws from which the entropy is estimated."""
 
 
-class RotationLaplace(Distribution):
+class RotationLaplace(ViewpointDensity):
     """Azimuth a, elevation e and tilt t of a rotation R with density exp(-d)/d up to a constant, d² = tr(S - AᵀR) + δ².
 
     Near the mode, d is proportional to the angle from it, so that log p falls linearly and not quadratically. log_prob
@@ -34,18 +27,9 @@ class RotationLaplace(Distribution):
         dtype: dtype of all results; by default the dtype of the parameter. All computations are in float64.
     """
 
-    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
-    has_rsample = False
-    __repr__ = one_line
-
     def __init__(self, parameter: Float[Tensor, "*batch 3 3"], dtype: torch.dtype | None = None) -> None:
         self.parameter = parameter
-        self.dtype = dtype or parameter.dtype
-        super().__init__(parameter.shape[:-2], torch.Size((3,)), validate_args=False)
-
-    @property
-    def support(self) -> constraints.Constraint:
-        return Circular(CHART)
+        super().__init__(parameter.shape[:-2], dtype or parameter.dtype)
 
     @property
     def mode(self) -> Float[Tensor, "*batch 3"]:
@@ -55,9 +39,8 @@ class RotationLaplace(Distribution):
     def log_prob(self, value: Float[Tensor, "... 3"]) -> Float[Tensor, "..."]:
         exact = value.double()
         square = functions.squared_distance(quaternions.of_viewpoint(exact), self.parameter)
-        volume = torch.log(torch.cos(exact[..., 1]).abs()) - math.log(VOLUME)
         log_normaliser = functions.log_normaliser(self.parameter)
-        return (volume - square.sqrt() - square.log() / 2 - log_normaliser).to(self.dtype)
+        return (log_volume(exact[..., 1]) - square.sqrt() - square.log() / 2 - log_normaliser).to(self.dtype)
 
     @torch.no_grad()
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
@@ -81,9 +64,21 @@ estimate.register(RotationLaplace, exact_estimate)
 
 
 @uniform.register
-def _(density: RotationLaplace) -> RotationLaplace:
+def _(density: RotationLaplace) -> UniformViewpoints:
     """Return the uniform density of rotations, which is cos e / 8π² on the chart."""
-    return RotationLaplace(torch.zeros_like(density.parameter), density.dtype)
+    like = density.parameter.new_zeros((), dtype=density.dtype)
+    return UniformViewpoints(like, density.batch_shape)
+
+
+@marginal.register
+def _(density: RotationLaplace, index: int) -> Angle:
+    """Return the density of one angle of the mixture over s, whose components have the falls sλ (`functions`)."""
+    frame = aligned_rotations.align(density.parameter)
+    scale, log_mass = functions.log_node_weights(frame.falls)
+    components = aligned_rotations.Frame(
+        frame.left.unsqueeze(-3), frame.right.unsqueeze(-3), frame.falls.unsqueeze(-2) * scale.unsqueeze(-1)
+    )
+    return Angle(density, index, components, log_mass.log_softmax(-1))
 
 
 @pick.register

@@ -8,11 +8,13 @@ from scipy import integrate
 
 from framework.configuration.schema import build, resolve
 from framework.distributions.density import Mixture
+from framework.distributions.protocol import marginal
 from framework.errors import ConfigError
 from framework.geometry.rotation import geodesic_distance, viewpoint_rotation
+from framework.heads.viewpoints import VOLUME
 from framework.target import Target
 from plugins.density_head.rotation_laplace import functions
-from plugins.density_head.rotation_laplace.density import VOLUME, RotationLaplace
+from plugins.density_head.rotation_laplace.density import RotationLaplace
 from plugins.density_head.rotation_laplace.functions import SOFTENING
 from plugins.density_head.rotation_laplace.rows import TARGET, log_normaliser
 
@@ -76,6 +78,36 @@ def test_tails_are_heavier_than_those_of_a_normal_density():
     # near the mode d = √100 ω, and ω² exp(-d)/d dω is a gamma density of d with shape 2
     assert angle.mean().item() * 10 == pytest.approx(2, rel=0.03)
     assert (angle.var() / angle.mean() ** 2).item() == pytest.approx(0.5, rel=0.1)
+
+
+@pytest.mark.parametrize("index", [0, 1, 2])
+@pytest.mark.parametrize("size", [0.0, 1.0, 4.0])
+def test_density_of_one_angle_is_the_integral_over_the_others(index, size):
+    """Away from the tip the density is smooth, so that 600 nodes for each of the other angles suffice."""
+    parameter = size * double([[0.5, -1.25, 0.75], [2.0, 0.125, -0.5], [0.25, 1.5, -1.0]])
+    density = RotationLaplace(parameter)
+    turn = (np.arange(600) / 600 * 2 - 1) * math.pi
+    node, weight = np.polynomial.legendre.leggauss(600)
+    axes = {
+        0: (turn, 2 * math.pi / 600),
+        1: (node * math.pi / 2, weight * math.pi / 2),
+        2: (turn, 2 * math.pi / 600),
+    }
+    rest = [other for other in range(3) if other != index]
+    tip = density.mode[index].item()
+    for angle in (tip + 0.4, tip - 0.9, 0.1):
+        if abs(angle - tip) < 0.3 or (index == 1 and abs(angle) > 1.5):
+            continue
+        values = np.empty((600, 600, 3))
+        values[..., index] = angle
+        values[..., rest[0]], values[..., rest[1]] = np.meshgrid(
+            axes[rest[0]][0], axes[rest[1]][0], indexing="ij"
+        )
+        masses = [np.broadcast_to(axes[other][1], 600) for other in rest]
+        height = density.log_prob(double(values)).exp().numpy()
+        expected = masses[0] @ height @ masses[1]
+        actual = marginal(density, index).log_prob(double([angle])).exp()
+        assert actual.item() == pytest.approx(expected, rel=1e-7)
 
 
 @pytest.mark.parametrize("shape", [(), (0,), (3, 2)])

@@ -10,7 +10,7 @@ from torch import Tensor
 from framework.distributions.shapes import broadcast_shapes
 from framework.geometry import quaternions
 from framework.geometry.aligned_rotations import Frame, log_height
-from plugins.density_head.matrix_fisher import quadrature
+from framework.heads import peak_quadrature as quadrature
 
 CHUNK = 2**18
 """Number of points at which the density is evaluated at once; arrays of 2 MB stay in the processor's cache."""
