@@ -392,7 +392,9 @@ def test_a_metric_of_the_results_ranks_its_own_way(
     assert ranking.rank(tmp_path, given, [], ["accuracy"], ["minimize"]).best == given[0]
     assert ranking.rank(tmp_path, given, [], ["parameters"]).best == given[1], "costs are to be low"
     assert ranking.rank(tmp_path, given, [], ["odd"], ["maximize"]).best == given[1]
-    with pytest.raises(ConfigError, match=r"has no known direction\. Set hydra\.sweeper\.direction"):
+    with pytest.raises(
+        ConfigError, match=r"does not state whether higher or lower is better\. Set hydra\.sweeper\.direction"
+    ):
         ranking.rank(tmp_path, given, [], ["odd"])
     with pytest.raises(
         ConfigError,

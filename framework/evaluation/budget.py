@@ -124,8 +124,8 @@ class Measure:
             )
         if key not in measures:
             raise ConfigError(
-                f"budget.metric = {key!r}: the metrics of this model have no such number with a known direction."
-                f"{did_you_mean(key, measures)} They have {', '.join(measures) or 'none'}."
+                f"budget.metric = {key!r} is no number of which a metric of this model states whether higher or lower "
+                f"is better.{did_you_mean(key, measures)} The metrics state it for {', '.join(measures) or 'none'}."
             )
         return measures[key]
 

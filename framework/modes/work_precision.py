@@ -133,12 +133,12 @@ def _choose_keys(names: list[str] | None, metrics: list[Metric], *, own: bool) -
 
     Args:
         names: Requested keys. None selects the error against a reference if `own` is True, and otherwise every key of
-            `metrics` with a known direction.
+            `metrics` of which it is known whether higher or lower values are better.
         metrics: Metrics of the session.
         own: Whether the knob is one of the density head, and not of an uncertainty wrapper.
 
     Raises:
-        ConfigError: No metric with a known direction has such a key.
+        ConfigError: A key belongs to no metric, or it is not known whether its higher or lower values are better.
     """
     known: dict[str, Literal["higher", "lower"]] = {
         key: metric.better[key] for metric in metrics for key in metric.columns if key in metric.better
@@ -148,11 +148,14 @@ def _choose_keys(names: list[str] | None, metrics: list[Metric], *, own: bool) -
     for key in keys:
         if key not in known:
             raise ConfigError(
-                f"mode.metrics: no metric with a known direction has the key {key!r}.{did_you_mean(key, known)} "
-                f"The keys are {', '.join(known)}."
+                f"mode.metrics: {key!r} is no number of a metric that states whether higher or lower values are better."
+                f"{did_you_mean(key, known)} Choose from {', '.join(known)}."
             )
     if not keys:
-        raise ConfigError("No metric has a known direction. Choose metrics that have one with metric=[...].")
+        raise ConfigError(
+            "No metric of this command states whether higher or lower values are better. Choose one that does with "
+            "metric=[...]."
+        )
     return {key: known[key] for key in keys}
 
 

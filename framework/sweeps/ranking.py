@@ -331,7 +331,7 @@ def _way(
     }
     if metric not in ways and direction is None:
         raise ConfigError(
-            f"hydra.sweeper.metric = {metric!r} has no known direction. Set "
+            f"hydra.sweeper.metric = {metric!r} does not state whether higher or lower is better. Set "
             f"hydra.sweeper.direction to minimize or maximize. {repeat}"
         )
     return _WAYS[direction] if direction is not None else ways[metric]

@@ -71,7 +71,7 @@ def compare(runs: Sequence[Mapping[str, Any]], overrides: Sequence[Sequence[str]
 
 
 def headline(compared: Comparison) -> str | None:
-    """Return the key of the first number with a known direction that is not a cost and that all rows have."""
+    """Return the key of the first number that all rows have, that is not a cost, and that has a better direction."""
     keys = (key for key in compared.runs[0]["columns"] if key in compared.better and key not in COST_COLUMNS)
     return next((key for key in keys if all(key in row for row in compared.rows)), None)
 
