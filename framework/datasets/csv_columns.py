@@ -508,7 +508,14 @@ def _other_reading(cell: str, writing: Writing) -> text.Suggestion | None:
 
 
 def remedy(mend: text.Suggestion, writing: Writing | None) -> str:
-    """Return advice on a cell with a number in another notation: settings that read it, or how to write the number."""
+    """Return advice on a cell that holds a number in a notation other than that of its table.
+
+    The advice names the settings that read the cell as a number, or the number to write into the cell.
+
+    Args:
+        mend: the number in the cell, and the settings that read it.
+        writing: notation of the table; None if no setting can change it.
+    """
     if writing is None or not mend.settings:
         return f"Write {mend.number}."
     ways = [

@@ -72,13 +72,13 @@ def choose_splits(
     test: float,
     random: np.random.Generator,
 ) -> NDArray:
-    """Return the split of every sample: the given one or, where none is given, one chosen at random.
+    """Return the split of every sample; samples that have no split yet get one at random.
 
     Args:
-        splits: Split of each sample; "" if none is given.
+        splits: Split of each sample; "" if the sample has none yet.
         labels: Class of each sample.
-        validation: Share of the samples for validation, if no sample is given to that split.
-        test: Share of the samples for the test, if samples without a split are given.
+        validation: Share of the samples for validation. It is not used if `splits` contains "validation".
+        test: Share of the samples for the test. It is used only if some samples have no split yet.
         random: Generator of the choice.
     """
     chosen = np.where(splits == "", "train", splits)

@@ -235,14 +235,16 @@ class Density:
 
 
 def merge(places: Array, resolution: Array) -> Array:
-    """Return the different places after each was rounded to a multiple of a power of two, at most its resolution.
+    """Round positions on the real line, and return each rounded position once.
+
+    A position is rounded to a multiple of the largest power of two that is at most its `resolution`.
 
     Args:
-        places: (place, *batch).
-        resolution: largest rounding step of each place, of the same shape.
+        places: positions, (place, *batch).
+        resolution: largest rounding step of each position, of the same shape.
 
     Returns:
-        Ascending places, (place, *batch); items with fewer places than others repeat their last one.
+        Ascending positions, (place, *batch); an item with fewer positions than others repeats its last one.
     """
     step = np.exp2(np.floor(np.log2(resolution)))
     rounded = np.sort((np.round(places / step) * step).reshape(len(places), -1), 0)
@@ -408,7 +410,11 @@ def wrap(angle: Array) -> Array:
 
 
 def half_circle_rule(concentration: Array, angle: Array) -> tuple[Array, Array]:
-    """Return points and weights of Gauss's rule for exp(κ (cos θ - 1)) from 0 to `angle`, or to where it ends."""
+    """Return points and weights of a Gauss-Legendre rule for integrals over θ from 0 to `angle`.
+
+    The rule is for integrands with the factor exp(κ (cos θ - 1)). The weights do not contain this factor. There are no
+    points where it is below exp(-40).
+    """
     sine = np.sqrt(_LEAST / 2 / np.maximum(concentration, _LEAST / 2))  # κ (1 - cos θ) = 2 κ sin²(θ/2)
     end = np.minimum(angle, 2 * np.arcsin(sine))
     shape = (-1, *(1,) * np.ndim(end))

@@ -282,12 +282,15 @@ def _smallest_scale_at(some: Tensor, place: Tensor, scale: Tensor, closed: bool)
 def first_in_cell(
     place: Float[Tensor, "peak item"], scale: Float[Tensor, "peak item"], width: float
 ) -> Bool[Tensor, "peak item"]:
-    """Return a mask of the peaks, in ascending order, that are the first peak in their cell of a grid.
+    """Divide the real line into cells, and return a mask of the peaks that are the first ones in their cells.
+
+    The width of a cell is `width` times the largest power of two that is at most the scale of the peak. Two peaks with
+    cells of different width are never in the same cell.
 
     Args:
-        place: ascending positions of the peaks.
+        place: positions of the peaks, ascending.
         scale: scales (widths) of the peaks.
-        width: largest width of a cell, in multiples of the peak's scale; a cell is at least half as wide as this.
+        width: largest width of a cell, in multiples of the scale of a peak.
     """
     cell = width * scale.log2().floor().exp2()
     key = (place / cell).floor()

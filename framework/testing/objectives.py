@@ -111,7 +111,12 @@ def examine_objective(row: ObjectiveRow, build: Make) -> Iterator[Finding]:
 
 
 def predictor_of(row: ObjectiveRow, count: int | None = None) -> Members:
-    """Return a predictor in training mode, with the same parameters at each call."""
+    """Return `Members` in training mode, with the same parameters at each call.
+
+    Args:
+        row: row of the objective.
+        count: number of networks of an ensemble; None for a predictor that is one network.
+    """
     torch.manual_seed(SEED)
     predictor = Members(row.target, count)
     predictor(batch_of(row, 32)["input"])  # sets the running moments of batch norm

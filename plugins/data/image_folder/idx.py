@@ -37,7 +37,9 @@ class Pair(NamedTuple):
 
 
 def find_pairs(root: Path) -> list[Pair]:
-    """Return the pairs of idx files in a folder, sorted by name; of a packed and an unpacked file, the unpacked one.
+    """Return the pairs of a file of images and a file of labels (idx format) in a folder, sorted by name.
+
+    If the folder holds a file both packed by gzip and unpacked, the unpacked file is used.
 
     Raises:
         DataError: A file of images has no file of labels, or the reverse.

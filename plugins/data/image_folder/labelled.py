@@ -203,7 +203,7 @@ class LabelledImages:
             )
 
     def crop(self, file: Path) -> Crop:
-        """Return the square of an image file that is an input."""
+        """Return the settings that read an image file as an input: the whole image, made square and scaled."""
         channels, side, _ = self.input_shape
         return Crop(file, None, 0.0, side, channels, upright=True)
 

@@ -9,20 +9,24 @@ LARGEST_FEATURE = 1e6
 
 
 class LatentDecoder(nn.Module):
-    """Network of two hidden layers that reads features and a latent vector z, with two additional linear paths.
+    """Network of two hidden layers that computes a component's raw parameters from features and a latent vector z.
 
-    One path adds a linear function of the features to the output, and the other a linear function of z.
+    Two linear paths lead past the hidden layers: a linear function of the features and a linear function of z are added
+    to the output.
 
-    The decoder reads `size` raw parameters of an item: `hidden` features, then `numbers` values that are added to the
-    output for every z, then `numbers × latent` values that modify the path linear in z. So the framework's linear layer
-    is the first layer of all three parts and is computed once per item. A layer of z alone is computed once per sample
-    and added to the features.
+    For each item of a batch, the decoder reads `size` numbers, which the framework's linear layer computes once for all
+    z. They are, in this order:
 
-    The two linear paths prevent a mixture over several numbers from collapsing. The path linear in the features shifts
-    all components together. So what every component must learn (an angle that the image determines) does not favour the
-    component that learned it first. The matrix `spread` of the path linear in z makes components differ from the first
-    step, and the features modify it. If a target has either of two opposite directions, its mean holds no information
-    about them, but its second moment does; this path can learn from the second moment at first order.
+    - `hidden` features. A linear function of z is added to them before the first ReLU.
+    - `numbers` values, the linear path from the features. They are added to the output for every z.
+    - `numbers × latent` values. They are added to the matrix `spread`, by which the other linear path multiplies z.
+
+    Without the two linear paths, the components of a mixture over several numbers may become equal during the training.
+    The path from the features shifts all components together. Therefore a property that all components have to learn
+    (such as an angle that the image determines) does not favour the component that learns it first. The path from z
+    makes the components differ from the first step on. It also learns a target that points in one of two opposite
+    directions with equal probability. The mean of such a target is 0 and says nothing about the directions, but its
+    second moment does, and the gradient of `spread` depends on the second moment.
 
     Args:
         latent: dimensions of z.

@@ -111,9 +111,9 @@ class MSSSIM(PerImage):
 
     Args:
         encoding: encoding in which colours are compared, "srgb" or "linear" RGB.
-        scales: number of scales; each further scale halves the image. The authors use five scales, which require sides
-            of 176 pixels; four scales require 88, three 44, and two 22. Results with different numbers of scales are
-            not comparable.
+        scales: number of scales; each further scale halves the image. Wang et al. (2003) use five scales, which require
+            sides of 176 pixels; four scales require 88, three 44, and two 22. Results with different numbers of scales
+            are not comparable.
 
     Raises:
         DataError: images are too small for the scales.

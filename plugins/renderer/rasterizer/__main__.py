@@ -99,7 +99,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_color(text: str) -> tuple[int, int, int] | None:
-    """Parse a colour and return red, green and blue from 0 to 255, or None for transparent."""
+    """Parse a colour such as "white" or "#20a0ff" into (red, green, blue) from 0 to 255; None for "transparent"."""
     if text == "transparent":
         return None
     try:
