@@ -190,9 +190,9 @@ Does the setting that `framework.load(run, budget=...)` chooses meet its limit i
 
     python -m benchmarks.framework.budgets
 
-Each model is trained shortly on synthetic data, and gets two limits: the middle between the run times of its stored
-and its cheapest setting, and the middle between their errors. `milliseconds` limits the time of one sample in a batch
-of {batch} on one thread: density, point prediction and error measure. After the choice, run time and error are
+Each model is trained for a short time on synthetic data, and gets two limits: the middle between the run times of its
+stored and its cheapest setting, and the middle between their errors. `milliseconds` limits the time of one sample in a
+batch of {batch} on one thread: density, point prediction and error measure. After the choice, run time and error are
 measured again, by code of this script: times are medians over five interleaved rounds (least to largest round), and
 errors are means over at most {samples} validation samples, with other random numbers than the choice used. *new /
 limit* is this measurement divided by the limit (if errors can be negative: one plus the excess as a share of the

@@ -87,8 +87,9 @@ class Sweep:
             time.sleep(0.2)
         running = sum(_status(job) == "RUNNING" for job in self.jobs)
         return (
-            f"after {time.monotonic() - self.begun:.0f} s, when each job had sent {LINES} lines or more "
-            f"({sum(map(_sent, self.jobs)):,} by all jobs) and {running} jobs were running"
+            f"after {time.monotonic() - self.begun:.0f} s. By then each job had sent {LINES} lines or more, all jobs "
+            f"together {sum(map(_sent, self.jobs)):,} lines, and {running} of the {RUNS} jobs were still training or "
+            "testing their model"
         )
 
     def finish(self) -> float:
@@ -135,8 +136,8 @@ def measure_outage(server: StoreServer) -> list[str]:
         again = sweep.count_logs("can be reached again after")
     return [
         f"{sweep.text()} trained {RUNS} models at the same time, in {seconds:.0f} s. The server was killed {reached}. "
-        f"It was started again {AWAY:.0f} s later, when {running} jobs were running; {again} jobs said that the store "
-        "could be reached again. After the end of the command, the journals were compared with the store:",
+        f"It was started again {AWAY:.0f} s later, when {running} jobs were still running; {again} jobs printed that "
+        "the store could be reached again. After the end of the command, the journals were compared with the store:",
         "",
         *TABLE,
         *rows(counts),

@@ -286,7 +286,8 @@ density given the image is known, and no method can have a higher mean log-likel
 
 ## Log-likelihood
 
-In nats, with respect to the volume in which all rotations measure π², as in Murphy et al. 2021. Higher is better.
+The table holds mean log-likelihoods in nats, with respect to the volume in which all rotations measure π², as in Murphy
+et al. 2021. Higher is better.
 
 {newline.join(likelihood)}
 
@@ -303,8 +304,8 @@ the same 8 epochs (2,500 steps); Murphy et al. 2021 train for 100,000 steps.
 
 ## Spread
 
-Mean angle between a rotation that is drawn from the predicted density and the nearest rotation that looks like the
-true one, degrees. That of the exact density is not 0, because labels are noisy.
+The table holds the mean angle, in degrees, between a rotation that is drawn from the predicted density and the nearest
+rotation that looks like the true one. For the exact density this angle is not 0, because labels are noisy.
 
 {newline.join(spread)}
 

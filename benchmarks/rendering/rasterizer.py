@@ -284,9 +284,8 @@ def report() -> str:
             "## Batches",
             "",
             "The method `Renderer.batch` of the renderer `rasterizer` renders several images at once. The table "
-            "compares this number of images per second of wall time with the number for single images. It holds the "
-            "best of "
-            "25 repetitions. `ratio` is the number of images per second divided by the number in the first row.",
+            "holds the number of images per second of wall time for single images and for batches, the best of 25 "
+            "repetitions. `ratio` is the number of images per second divided by the number in the first row.",
             "",
             *batch_table(scenes[0]),
             "",

@@ -332,7 +332,7 @@ def report() -> str:
             "images) with a crop or with bfloat16. Each cell holds the largest difference of a colour value from the "
             "image that is computed as a whole in float32, on a scale of 0 to 255, and in brackets the mean "
             "difference. `margin` is the number of pixels around the box of the subject that the network computes as "
-            "well. The last two columns are two sizes of the image in pixels.",
+            "well. The headings of the last two columns are the sizes of the images in pixels.",
             "",
             "| network | setting | "
             + " | ".join(f"{height} × {width}" for height, width in SIZES[::-1])

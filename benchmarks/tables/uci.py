@@ -338,9 +338,9 @@ def page(root: Path) -> None:
         "better. Each number is a mean over the splits, and ± is its standard error. Splits share rows, so the "
         "standard errors are too small; compare methods by the paired differences. The difference is ours minus the "
         "other method on the same split. The 90 % region is the region of highest density. `MC dropout, published "
-        "per split` "
-        "are result files of its authors. The peers of scikit-learn predict a normal density with the standard "
-        "deviation of the residuals on a tenth of the training rows; NGBoost stops early on such a tenth. "
+        "per split` holds the results that the authors of the method published for each split. The peers of "
+        "scikit-learn predict a normal density with the standard deviation of the residuals on a tenth of the training "
+        "rows; NGBoost stops early on such a tenth. "
         "`uci/ensemble` and `uci/mc_dropout` are networks of one layer with 50 units, as in the literature, trained by "
         "this framework.",
         "",

@@ -281,9 +281,9 @@ def report(rows: Record) -> str:
             "with photographs over the whole frame, or inside, that is over the pixels of the subject. ± is the "
             "standard deviation over seeds, if there are several.",
             "",
-            "Each row of the table with another number of epochs is a separate training run of a rendering network, "
-            "because the learning rate falls to 0 at the end of a training. The minutes are the number of epochs "
-            "multiplied by the time of the shortest epoch, on one core.",
+            "Every number of epochs is a separate training run of the network, because the learning rate falls to 0 at "
+            "the end of a training. The minutes are the number of epochs multiplied by the time of the shortest epoch, "
+            "on one core.",
             "",
             f"![Quality against minutes of training]({HERE.stem}.png)",
             "",
