@@ -59,7 +59,7 @@ def nodes(
     index, order = index.where(~absent, GRID).sort(-1)
     absent = absent.gather(-1, order)
     summit = grid.gather(-1, index)
-    peak, width = _refine(
+    peak, width = refine(
         log_density, summit, step, (summit - step).maximum(ends[0]), (summit + step).minimum(ends[1])
     )
     peak = peak.where(~absent, ends[1])
@@ -105,20 +105,24 @@ def maximum(
     log_density: Callable[[Tensor], Tensor], starts: Float[Tensor, "*batch start"], step: float
 ) -> Float[Tensor, "*batch"]:
     """Return the position, radians, of the highest maximum of `log_density` within the distance `step` of a start."""
-    peaks, _ = _refine(log_density, starts, step, starts - step, starts + step)
+    peaks, _ = refine(log_density, starts, step, starts - step, starts + step)
     best = log_density(peaks).argmax(-1, keepdim=True)
     return peaks.gather(-1, best).squeeze(-1)
 
 
-def _refine(
-    log_density: Callable[[Tensor], Tensor], centre: Tensor, reach: float, low: Tensor, high: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return the peak in [low, high] near each start `centre`, and its width.
+def refine(
+    log_density: Callable[[Tensor], Tensor],
+    centre: Float[Tensor, "*batch start"],
+    reach: float | Tensor,
+    low: Tensor,
+    high: Tensor,
+) -> tuple[Float[Tensor, "*batch start"], Float[Tensor, "*batch start"]]:
+    """Return the peak in [low, high] near each start `centre`, and its width, radians.
 
     The width is the distance from the peak at which the log-density has fallen by about 1. A peak is found by parabolas
     through three points, which are `reach` apart at first and come closer with each round.
     """
-    width, step = torch.full_like(centre, torch.inf), torch.full_like(centre, reach)
+    width, step = torch.full_like(centre, torch.inf), torch.zeros_like(centre) + reach
     for _ in range(ROUNDS):
         three = log_density(torch.cat([centre - step, centre, centre + step], -1))
         left, middle, right = three.split(centre.shape[-1], -1)

@@ -1,7 +1,7 @@
 """Independent projected normal angles as a torch distribution."""
 
 import math
-from typing import no_type_check
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -12,12 +12,11 @@ from framework.distributions.circular import circular, grid, wrap
 from framework.distributions.description import one_line
 from framework.distributions.panels import entropy_of_one
 from framework.distributions.protocol import estimate, exact_estimate, marginal, mode_candidates, pick, take
+from framework.heads.peak_quadrature import refine
 from plugins.density_head.projected_normal import functions
 
 POINTS = 180
 """Number of angles of the grid on which the search for the mode begins."""
-STEPS = 70
-"""Number of steps of the golden-section search; each shortens the interval by a factor of 0.618."""
 
 
 class ProjectedNormal(Distribution):
@@ -53,7 +52,6 @@ class ProjectedNormal(Distribution):
     def log_prob(self, value: Tensor) -> Tensor:
         return self._of_each(value).sum(-1).to(self.dtype)
 
-    @no_type_check
     def _of_each(self, value: Tensor) -> Tensor:
         """Return the log-density of each angle, float64."""
         return functions.log_prob(value.double(), self.mean_vector.double(), self.factor.double())
@@ -73,39 +71,32 @@ class ProjectedNormal(Distribution):
     @torch.no_grad()
     def mode(self) -> Tensor:
         """Angles of the highest densities, (*batch, angle)."""
-        candidates = self.candidates()
-        best = self._of_each(candidates).argmax(0, keepdim=True)
-        return candidates.gather(0, best).squeeze(0).to(self.dtype)
+        best = self._of_each(self.candidates).argmax(0, keepdim=True)
+        return self.candidates.gather(0, best).squeeze(0).to(self.dtype)
 
+    @cached_property
     @torch.no_grad()
     def candidates(self) -> Float[Tensor, "3 *batch angle"]:
-        """Return three angles for each angle, at least one of which is its mode, float64.
+        """Three angles for each angle, at least one of which is its mode, float64.
 
-        A golden-section search begins at the two highest maxima on a grid, and at the direction of μ, around which
-        a concentrated density has its only peak.
+        The search begins at the two highest maxima on a grid, and at the direction of μ, around which a concentrated
+        density has its only peak.
         """
         around = grid(POINTS, dtype=torch.float64, device=self.mean_vector.device)
-        shape = (POINTS, *(1,) * (len(self.batch_shape) + 1))
-        height = self._of_each(around.reshape(shape))
+        height = self._of_each(around.reshape(POINTS, *(1,) * (len(self.batch_shape) + 1)))
         higher = height >= torch.maximum(height.roll(1, 0), height.roll(-1, 0))
         summits = height.where(higher, -math.inf).topk(2, 0).indices
         x, y = self.mean_vector.double().unbind(-1)
-        start = torch.cat([around[summits], torch.atan2(y, x).unsqueeze(0)])
+        start = torch.cat([around[summits], torch.atan2(y, x).unsqueeze(0)]).movedim(0, -1)
         reach = torch.full_like(start, 2 * math.pi / POINTS)
         # |P| = 1: no direction of the normal vector is wider than the norm of L
         norm = 1 + self.factor.double().abs().sum(-1).exp()
-        reach[2] = (4 * norm / torch.hypot(x, y).clamp(min=1e-300)).clamp(max=2 * math.pi / POINTS)
-        return wrap(self._highest(start - reach, start + reach))
+        reach[..., 2] = (4 * norm / torch.hypot(x, y).clamp(min=1e-300)).clamp(max=2 * math.pi / POINTS)
 
-    @no_type_check
-    def _highest(self, low: Tensor, high: Tensor) -> Tensor:
-        """Return the maximum between `low` and `high` by golden-section search (Kiefer 1953)."""
-        ratio = (math.sqrt(5) - 1) / 2
-        for _ in range(STEPS):
-            left, right = high - ratio * (high - low), low + ratio * (high - low)
-            rises = self._of_each(left) < self._of_each(right)
-            low, high = torch.where(rises, left, low), torch.where(rises, high, right)
-        return (low + high) / 2
+        def log_density(points: Tensor) -> Tensor:
+            return self._of_each(points.movedim(-1, 0)).movedim(0, -1)
+
+        return wrap(refine(log_density, start, reach, start - reach, start + reach)[0]).movedim(-1, 0)
 
     def entropy(self) -> Tensor:
         """Return the entropy, nats, (*batch), by quadrature; without gradient."""
@@ -132,5 +123,4 @@ def _(density: ProjectedNormal, index: Tensor) -> ProjectedNormal:
 
 @mode_candidates.register
 def _(density: ProjectedNormal) -> Tensor:
-    candidates = density.candidates().to(density.dtype)
-    return torch.cat([density.mode.unsqueeze(0), candidates])
+    return torch.cat([density.mode.unsqueeze(0), density.candidates.to(density.dtype)])

@@ -9,7 +9,6 @@ Only the direction of X counts, so that |P| = 1 can be required: P = LLᵀ with 
 """
 
 import math
-from typing import no_type_check
 
 import torch
 from jaxtyping import Float
@@ -21,7 +20,6 @@ TERMS = (1.0, -3.0, 15.0, -105.0, 945.0, -10395.0, 135135.0)
 """Coefficients of D⁻², D⁻⁴, … in the asymptotic series of g(D) exp(D²/2); the next term is below 1e-14 at FAR."""
 
 
-@no_type_check  # a search calls it hundreds of times
 def log_prob(
     angle: Float[Tensor, "..."], mean: Float[Tensor, "... 2"], factor: Float[Tensor, "... 2"]
 ) -> Float[Tensor, "..."]:
@@ -45,7 +43,6 @@ def log_prob(
     return -across / 2 + log_g(along) - length.log() - math.log(2 * math.pi)
 
 
-@no_type_check
 def log_g(value: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Return log g(D) with g(D) = exp(-D²/2) + √(2π) D Φ(D), accurate and differentiable for all D."""
     high = value.clamp(min=0)
