@@ -108,7 +108,7 @@ def exported(density: Distribution) -> Exported:
     """
     raise ConfigError(
         f"A {type(density).__name__} cannot be exported, because its values are not a function of a few tensors that "
-        "NumPy could read: it draws random numbers, or nobody has registered one with "
+        "NumPy could read: it draws random numbers, or no such function is registered with "
         "`framework.distributions.exported.exported.register`. Use framework.load or framework.freeze for this model."
     )
 

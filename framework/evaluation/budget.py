@@ -124,8 +124,8 @@ class Measure:
             )
         if key not in measures:
             raise ConfigError(
-                f"budget.metric = {key!r} is no number of which a metric of this model states whether higher or lower "
-                f"is better.{did_you_mean(key, measures)} The metrics state it for {', '.join(measures) or 'none'}."
+                f"budget.metric = {key!r}: a budget needs a number of which a metric states whether higher or lower is "
+                f"better.{did_you_mean(key, measures)} The metrics of this model have {', '.join(measures) or 'none'}."
             )
         return measures[key]
 

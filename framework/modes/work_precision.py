@@ -148,8 +148,8 @@ def _choose_keys(names: list[str] | None, metrics: list[Metric], *, own: bool) -
     for key in keys:
         if key not in known:
             raise ConfigError(
-                f"mode.metrics: {key!r} is no number of a metric that states whether higher or lower values are better."
-                f"{did_you_mean(key, known)} Choose from {', '.join(known)}."
+                f"mode.metrics names {key!r}, but a number is required of which a metric states whether higher or "
+                f"lower is better.{did_you_mean(key, known)} Choose from {', '.join(known)}."
             )
     if not keys:
         raise ConfigError(

@@ -191,10 +191,8 @@ class LabelledImages:
     ) -> None:
         for split, chosen in indices.items():
             if not len(chosen):
-                raise DataError(
-                    f"{root}: The {split} split is empty ({len(labels)} images in all). Add images, or increase "
-                    "data.validation and data.test."
-                )
+                remedy = "Add images." if split == "train" else f"Add images, or increase data.{split}."
+                raise DataError(f"{root}: The {split} split is empty ({len(labels)} images in all). {remedy}")
         missing = set(range(len(classes))) - set(labels[indices["train"]].tolist())
         if missing:
             raise DataError(

@@ -230,8 +230,8 @@ class PredictionSet(Mixture, ValueSet):
         """
         if not self._one_number:
             raise UserError(
-                "intervals() exists only for sets of one angle or one real. For classes use labels(); for several "
-                "numbers use contains(value), or the prediction set of the marginal() of each number."
+                "intervals() exists only for sets of one angle or one real number. For classes use labels(); for "
+                "several numbers use contains(value), or the prediction set of the marginal() of each number."
             )
         return self._ends.intervals
 
