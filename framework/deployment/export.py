@@ -185,7 +185,7 @@ def export(predictor: Predictor, description: Description, into: Path) -> Mappin
     Args:
         predictor: model in evaluation mode, as `load_with_description` returns it.
         description: its description.
-        into: folder to write; it must not exist or be empty.
+        into: folder to write; a new folder or an empty one.
 
     Raises:
         ConfigError: a package is missing, the model cannot be exported, or the exported model differs from it.
