@@ -198,7 +198,13 @@ def _limited(
 def rotations(
     body: Body, where: Skeleton, movements: Float[np.ndarray, "pose movement"]
 ) -> Float[np.ndarray, "pose joint 3"]:
-    """Return the joint rotations, axis times angle in radians, with which a body makes the movements `movements`."""
+    """Return the joint rotations that put a body into the given poses, each as axis times angle in radians.
+
+    Args:
+        body: the body; angles are measured from its rest pose as the module's text defines them.
+        where: the joints that each movement rotates.
+        movements: angle of each movement in each pose, degrees, in the order of MOVEMENTS ("left elbow", "lean").
+    """
     angle = dict(zip(MOVEMENTS, np.radians(movements).T, strict=True))
     count, joints = len(movements), body.joints.astype(np.float64)
     joint_rotations = [Rotation.identity(count)] * len(body.parents)

@@ -70,9 +70,14 @@ class Sheet:
         return self.corners[-1].faces
 
     def interpolate(self, values: np.ndarray, stages: int | None = None) -> np.ndarray:
-        """Return values at the body's vertices, interpolated to the sheet's vertices after the first `stages` stages.
+        """Return values at the sheet's vertices, interpolated linearly from `values` at the body's vertices.
 
-        If `stages` is None, all stages are used.
+        Args:
+            values: one row for each vertex of the body.
+            stages: number of times that all edges have been split; None for the final sheet.
+
+        Returns:
+            One row for each vertex of the body's mesh after `stages` splits of all edges.
         """
         return _interpolate(values, self.pairs[:stages])
 

@@ -50,7 +50,7 @@ def _add_trainer_keys(arguments: list[str]) -> list[str]:
 
 
 def _list_loggers(arguments: list[str]) -> list[str]:
-    """Replace `logger=[mlflow,csv]` by the store, `logger=mlflow`, and the further forms, `logger.copies=[csv]`.
+    """Replace `logger=[mlflow,csv]` by the store, `logger=mlflow`, and the further formats, `logger.copies=[csv]`.
 
     Raises:
         ConfigError: There is no such logger, or `none` stands beside another one.

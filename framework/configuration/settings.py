@@ -116,7 +116,7 @@ class LoggerSettings(_Strict):
     """
     experiment: str | None = None
     copies: list[Literal["csv", "tensorboard", "wandb"]] = []
-    """Further forms in which the numbers are written into the run folder."""
+    """Further formats in which the numbers are written into the run folder."""
 
 
 class BudgetSettings(_Strict):

@@ -60,9 +60,12 @@ class OnnxNetwork(nn.Module):
 def use_onnx(predictor: Predictor, shape: Sequence[int], dtype: torch.dtype) -> int:
     """Replace the networks of a predictor, in place, by networks that ONNX Runtime computes where this is possible.
 
-    Networks keep their form if the packages are not installed, their inputs are point clouds, whose encoders check
-    them, a layer such as dropout is random in evaluation, a wrapper varies their weights, or ONNX has no form for a
-    layer.
+    A network is not replaced in any of these cases:
+    - The packages of ONNX are not installed.
+    - Its inputs are point clouds, because the encoders check the values of clouds.
+    - A layer, such as dropout, is random in evaluation.
+    - An uncertainty wrapper varies its weights.
+    - ONNX cannot express one of its layers, or ONNX Runtime returns other results than torch (`AGREEMENT`).
 
     Args:
         predictor: predictor in evaluation mode, on the CPU.

@@ -85,9 +85,9 @@ def _(density: Distribution, temperature: Tensor) -> Distribution:
         return CircularPower(density, temperature)
     raise UserError(
         f"The temperature of {type(density).__name__} over {tuple(density.event_shape)} numbers cannot be changed, "
-        "because the framework does not know how to normalise the power p^(1/T). Register this power with "
-        "`framework.distributions.protocol.tempered_density.register`, or leave out the wrapper that changes the "
-        "temperature."
+        "because the framework does not know how to normalise p^(1/T). Register a function that returns this "
+        "density with `framework.distributions.protocol.tempered_density.register`, or leave out the wrapper that "
+        "changes the temperature."
     )
 
 
@@ -214,9 +214,9 @@ class CircularPower(Distribution):
             else:
                 raise UserError(
                     f"{type(density).__name__} at temperature {float(temperature.detach()):g} is too narrow for a grid "
-                    f"of {MOST_POINTS} angles (the log of its mass has an error of {off.max().item():.2g}). Register "
-                    "its power with `framework.distributions.protocol.tempered_density.register`, or raise the "
-                    "temperature's lower bound."
+                    f"of {MOST_POINTS} angles (the log of its mass has an error of {off.max().item():.2g}). Raise "
+                    "the lower bound of the temperature, or register a function that returns the tempered density with "
+                    "`framework.distributions.protocol.tempered_density.register`."
                 )
             off = self._fill()
 

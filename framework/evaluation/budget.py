@@ -124,8 +124,9 @@ class Measure:
             )
         if key not in measures:
             raise ConfigError(
-                f"budget.metric = {key!r}: a budget needs a number of which a metric states whether higher or lower is "
-                f"better.{did_you_mean(key, measures)} The metrics of this model have {', '.join(measures) or 'none'}."
+                f"budget.metric = {key!r} cannot be the error of a budget. It must be a number for which a metric "
+                f"states whether higher or lower is better.{did_you_mean(key, measures)} The metrics of this model "
+                f"have {', '.join(measures) or 'no such number'}."
             )
         return measures[key]
 

@@ -99,7 +99,7 @@ def entropy(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
 
 @torch.no_grad()
 def align(parameter: Float[Tensor, "*batch 3 3"]) -> Frame:
-    """Return the proper singular value decomposition of F, float64.
+    """Return the proper singular value decomposition of F, which is `parameter`, float64.
 
     If singular values are equal, the decomposition is not unique, and any one of them is returned.
     """

@@ -169,7 +169,8 @@ class Angle(Distribution):
     def mode(self) -> Float[Tensor, "*batch 1"]:
         """Angle of the highest density, radians, (*batch, 1).
 
-        It is the highest of the peaks near the SUMMITS maxima on a grid and near this angle of the joint mode.
+        The density is maximised from several starting points, and the highest result is returned. The starting points
+        are the SUMMITS highest maxima on a grid, and this angle in the mode of all three angles.
         """
         points = 90
         around = grid(points, dtype=torch.float64, device=self.frame.falls.device)

@@ -133,7 +133,7 @@ def _choose_keys(names: list[str] | None, metrics: list[Metric], *, own: bool) -
 
     Args:
         names: Requested keys. None selects the error against a reference if `own` is True, and otherwise every key of
-            `metrics` of which it is known whether higher or lower values are better.
+            `metrics` for which a metric states whether higher or lower values are better.
         metrics: Metrics of the session.
         own: Whether the knob is one of the density head, and not of an uncertainty wrapper.
 
@@ -148,8 +148,8 @@ def _choose_keys(names: list[str] | None, metrics: list[Metric], *, own: bool) -
     for key in keys:
         if key not in known:
             raise ConfigError(
-                f"mode.metrics names {key!r}, but a number is required of which a metric states whether higher or "
-                f"lower is better.{did_you_mean(key, known)} Choose from {', '.join(known)}."
+                f"mode.metrics names {key!r}, but every name must be a number for which a metric states whether higher "
+                f"or lower is better.{did_you_mean(key, known)} Choose from {', '.join(known)}."
             )
     if not keys:
         raise ConfigError(

@@ -38,9 +38,12 @@ if TYPE_CHECKING:
 HOW = ("threads", "workers", "logger.uri")
 """Keys that do not affect the result of a run, so that a resumed run may have other values of them."""
 PROCESSES = ("trainer.devices", "trainer.num_nodes", "trainer.strategy")
-"""Keys that say how many processes train; a resumed run may have other values, which change its results by rounding."""
+"""Keys that say how many processes train.
+
+Their values may change when a run is resumed; the results then differ by rounding.
+"""
 CHANGEABLE = (*HOW, *PROCESSES)
-"""Keys of which a resumed run may have other values."""
+"""Keys whose values may change when a run is resumed."""
 TRAINED = ("last.ckpt", "previous.ckpt")
 """Names of checkpoints from which training can resume; all others hold weights only."""
 BEST = "best.ckpt"

@@ -63,7 +63,7 @@ class Process(Protocol):
 
 
 class LocalProcess:
-    """Values of `Process` for every process on this machine."""
+    """Values of the attributes of `Process` that are the same for every process on this machine."""
 
     handle: str | None = None
     alive: bool = True
@@ -80,7 +80,7 @@ a lock that is held until the last process of the job has ended.
 
 
 class SeparateProcess(LocalProcess):
-    """Job in a new Python process, as `Process` describes it; the constructor is a `Starter`."""
+    """Job in a new Python process; an implementation of `Process` whose constructor is a `Starter`."""
 
     def __init__(
         self, command: Sequence[str], environment: Mapping[str, str], console: int, lock: int
@@ -184,7 +184,7 @@ class _Server:
         self._channel.settimeout(PATIENCE)
         try:
             if not self._channel.recv(LARGEST):
-                raise OSError("the process that starts the jobs ended at its own start")
+                raise OSError("the process that starts the jobs ended before it was ready")
         except OSError:
             self.close()
             raise

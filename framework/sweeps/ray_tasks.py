@@ -114,7 +114,7 @@ def run_task(job: NodeJob) -> None:
 
 
 class RayProcess:
-    """Task of Ray, as `Process` describes it."""
+    """Task of Ray that runs a job; an implementation of the protocol `Process`."""
 
     pid = None
     alive = True

@@ -29,7 +29,7 @@ class Comparison:
         runs: Results of the runs, one row each.
         rows: Means over the runs that differ in their seed only.
         by: Keys that distinguish the rows: "method", "data" and varied settings.
-        varied: Settings of which the runs have several values.
+        varied: Settings whose values differ between the runs.
         columns: Headings of the table by key.
         better: Directions of the columns.
     """

@@ -113,7 +113,7 @@ class Slurm:
 
 
 class SlurmProcess:
-    """Job of SLURM, as `Process` describes it.
+    """Job of SLURM; an implementation of the protocol `Process`.
 
     Args:
         handle: Handle of the job, "slurm:" and its id.

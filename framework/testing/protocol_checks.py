@@ -227,7 +227,11 @@ def known_widths(density: Distribution) -> Tensor:
 
 
 def check_normals(density: Distribution, worst: Worst) -> None:
-    """Check that `normals` gives log p and that `mahalanobis` is -2 log p plus a constant, if they are known."""
+    """Check `protocol.normals` and `protocol.mahalanobis` against log_prob.
+
+    The log-density of the mixture that `normals` returns must equal log_prob, and the distance that `mahalanobis`
+    returns must be -2 log_prob plus a constant. A function that returns None for this density is not checked.
+    """
     worst.count(False, "neither normals nor mahalanobis is known")
     value = draws_and_mode(density)
     log_prob = density.log_prob(value).double()

@@ -146,7 +146,7 @@ def png(pixels: NDArray) -> bytes:
 
 
 def quad() -> tuple[Entry, list[NDArray | bytes]]:
-    """Return the description of a textured square (`QUAD`) and its binary parts."""
+    """Return the glTF description of a textured square (`QUAD`), and the binary parts to which it refers."""
     return QUAD, [*PARTS, png(np.zeros((4, 4, 3), np.uint8))]
 
 

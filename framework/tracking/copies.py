@@ -1,4 +1,4 @@
-"""Further forms in which the numbers of a run are written beside its journal: CSV, TensorBoard, Weights & Biases.
+"""Further formats in which the numbers of a run are written beside its journal: CSV, TensorBoard, Weights & Biases.
 
 Nothing leaves the machine by default. Weights & Biases writes its files into the run folder and sends nothing
 (`WANDB_MODE=offline`), unless the user sets WANDB_MODE.
@@ -25,11 +25,11 @@ _log = logging.getLogger(__name__)
 
 Form = Literal["csv", "tensorboard", "wandb"]
 PACKAGES: Mapping[Form, str] = {"tensorboard": "tensorboard", "wandb": "wandb"}
-"""Package that a form needs; it is the project's extra of the same name."""
+"""Package that a format needs; it is the project's extra of the same name."""
 
 
 def require_packages(forms: Sequence[Form]) -> None:
-    """Refuse a form whose package is not installed.
+    """Refuse a format whose package is not installed.
 
     Raises:
         ConfigError: The package is missing.
@@ -43,7 +43,7 @@ def require_packages(forms: Sequence[Form]) -> None:
 
 
 class Copy(ABC):
-    """Contract of a further form of a run's record.
+    """Contract of a further format in which the numbers of a run are written.
 
     `CopyingTracker` calls the methods after it has written the journal. An error ends the copy, and never the run.
 
@@ -184,11 +184,11 @@ COPIES: Mapping[Form, type[Copy]] = {"csv": CsvCopy, "tensorboard": TensorBoardC
 
 @final
 class CopyingTracker(Tracker):
-    """Tracker that records a run as another tracker does, and then writes copies in further forms.
+    """Tracker that records a run by another tracker, and also in further formats such as CSV or TensorBoard.
 
     Args:
         tracker: Tracker that writes the journal.
-        copies: Further forms.
+        copies: One writer for each further format.
     """
 
     def __init__(self, tracker: Tracker, copies: Sequence[Copy]) -> None:

@@ -405,7 +405,7 @@ def main() -> None:
     seed_sentence = (
         "No row has several seeds, so the second variance is missing here."
         if math.isnan(among_seeds)
-        else "The resulting standard deviation of the accuracy of one run among seeds is "
+        else "It corresponds to a standard deviation of the accuracy between seeds of "
         f"{100 * math.sqrt(among_seeds):.2f} points."
     )
     text = (
@@ -433,12 +433,14 @@ def main() -> None:
         "- **ms, batch of 1** is the time of one cloud predicted alone, and **ms / cloud, batch of 256** that of a "
         "cloud in a batch. Both are measured on one thread and include the encoding.\n\n"
         f"{markdown(table, COLUMNS, better=BETTER)}\n\n"
-        "In the table of Tables 6.1 to 6.3, the number after ± of accuracy and NLL (negative log-likelihood) is the "
-        "standard error for new test clouds and new seeds. Its square is the sum of two variances. For the first, "
-        "the result of each cloud is averaged over seeds; the variance of these averages over the clouds is divided "
-        "by the number of clouds. The second is the variance of a result between seeds, without the part that comes "
-        "from the finite number of clouds, divided by the number of seeds. It is estimated once from all rows with "
-        f"several seeds (two-way analysis of variance) and is also used for rows with one seed. {seed_sentence}\n\n"
+        "In the table above, the number after ± of accuracy and NLL (negative log-likelihood) is the standard error "
+        "for new test clouds and new seeds. Its square is the sum of two variances:\n"
+        "- The first is for the choice of test clouds. The result of each cloud is averaged over seeds; the variance "
+        "of these averages over the clouds is divided by the number of clouds.\n"
+        "- The second is for the choice of seeds: the variance of a result between seeds, without the part that "
+        "comes from the finite number of clouds, divided by the number of seeds. The variance between seeds is "
+        "estimated once from all rows with several seeds (two-way analysis of variance) and is also used for rows "
+        f"with one seed. {seed_sentence}\n\n"
         "## The thesis's claims\n\n"
         "In the table, each claim of the thesis (bold) is tested by one or several comparisons below it. A "
         "comparison is a difference of accuracies on the same test clouds, in percentage points, ± the standard "

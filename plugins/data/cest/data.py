@@ -260,7 +260,7 @@ def _remarks(volume: Volume, offsets: Sequence[float]) -> tuple[str, ...]:
     if outside:
         remarks.append(f"left out: {outside} voxels outside the mask, or without a number")
     if volume.dropped:
-        remarks.append(f"left out: {volume.dropped} voxels of which a number is not finite")
+        remarks.append(f"left out: {volume.dropped} voxels with a number that is not finite")
     if volume.unread:
         remarks.append(f"left out: arrays that are not read ({', '.join(volume.unread)})")
     if len(volume.offsets) != len(offsets) or not np.allclose(volume.offsets, offsets):

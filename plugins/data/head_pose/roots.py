@@ -38,7 +38,10 @@ def write_idiap(root: Path) -> Path:
 def publish_idiap(
     root: Path, train: Iterable[int] = range(20), test: Iterable[int] = range(20, 31), **more: Any
 ) -> None:
-    """Write the IDIAP labels of the images with these numbers, and further struct arrays."""
+    """Write the file of IDIAP labels of the images with the numbers `train` and `test` into the folder `root`.
+
+    Each name in `more` adds a struct array to the file; its value holds the rows, as `idiap_row` returns them.
+    """
     rows = {"or_label_train": [*map(idiap_row, train)], "or_label_test": [*map(idiap_row, test)], **more}
     save_idiap(root / "or_label_full.mat", **rows)
 

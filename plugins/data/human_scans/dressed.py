@@ -69,11 +69,13 @@ class RegisteredBody:
 class Clothes(NamedTuple):
     """A person's clothes and hair, independent of the pose.
 
+    The arrays have one entry for each vertex of the sheet, which is the body's mesh with its edges split in the middle.
+
     Attributes:
-        colors: linear RGB of each vertex of the sheet.
-        raised: distance of cloth and hair from the skin, metres.
-        cover: share of the body's details that cloth hides at each vertex, 0 to 1.
-        skirt: skirt that hangs beside the body, or None.
+        colors: linear RGB of the person's surface: skin, cloth or hair.
+        raised: height of cloth or hair above the skin, metres; 0 on bare skin.
+        cover: share by which cloth smooths the details of the body, from 0 (bare skin) to 1.
+        skirt: skirt, a surface of its own around the body; or None.
         hair: hair of the person.
     """
 

@@ -88,7 +88,7 @@ class BiternionVGG(Encoder):
 
 
 def _smallest(convolutions: int) -> int:
-    """Return the side, in pixels, of the smallest image of which the convolutions and poolings leave one pixel."""
+    """Return the side, in pixels, of the smallest image that has one pixel after all convolutions and poolings."""
     side = 1
     for index in reversed(range(convolutions)):
         side = (side * 2 if index in range(1, convolutions - 1, 2) else side) + 2

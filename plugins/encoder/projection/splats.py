@@ -61,8 +61,9 @@ def compute_surface(
     distance from the point, the depth of the cone grows by the width of a pixel. In each pixel, the nearest cone gives
     the depth of the surface and the distance, in pixels, to the cone's point. The fifth channel is this distance as a
     share of radius + 1, or 1 if no point is within `radius`. The first four channels are the mean of the points of the
-    surface within `radius`, weighted by a Gaussian that is wider if the cone's point is farther away. They are 1
-    outside the outline of the subject, which is a morphological closing of the pixels that show a point.
+    surface within `radius`, weighted by a Gaussian that is wider if the cone's point is farther away. In pixels that
+    do not belong to the subject these four channels are 1. The pixels of the subject are those that show a point, with
+    the gaps between them filled by a morphological closing.
 
     On the CPU the function is compiled unless a gradient is required. All implementations give the same bits. It is
     differentiable in the channels of the images, but not in the set of visible points.

@@ -13,7 +13,7 @@ def curve(levels: np.ndarray, share: np.ndarray, count: int, title: str, *, synt
     A band contains the share at each mass with probability 0.95 if the densities are calibrated.
 
     Args:
-        levels: masses, ascending in (0, 1).
+        levels: masses (probabilities) of the regions, ascending in (0, 1).
         share: share of targets in the region of each mass; NaN (not drawn) if there were no targets.
         count: number of targets.
         title: title of the figure.

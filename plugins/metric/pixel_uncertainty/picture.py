@@ -26,8 +26,9 @@ def sheet(
 
     Args:
         panels: caption → (height, width, 2 · channel + 2): truth, point prediction, error and scale of each pixel.
-        levels: masses, ascending in (0, 1).
-        shares: region → share of values in the intervals of these masses.
+        levels: probabilities of the central intervals of each pixel's density, ascending in (0, 1).
+        shares: part of the images, such as "inside the mask" → share of its pixel values that lie in the central
+            interval of each probability in `levels`.
         count: number of images.
         title: title of the figure.
         synthetic: whether the data are synthetic; the title then says so.
