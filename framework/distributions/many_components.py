@@ -39,8 +39,8 @@ def likeliest_modes(
 ) -> Float[Tensor, "kept *batch 1"] | None:
     """Return those modes of components at which a mixture is highest, or None if they are not found by interpolation.
 
-    The log-density of the mixture at the modes is interpolated with an error of about 1e-4 nats, so that the mode where
-    it is highest may be missing if it is higher than the returned ones by less than this.
+    The log-density of the mixture at the modes is interpolated with an error of about 1e-4 nats. The best mode may
+    therefore be missing if the log-density there exceeds that at a returned mode by less than this error.
 
     Args:
         components: a density of one number with batch_shape (*batch, K), with K modes for each item of the batch. If

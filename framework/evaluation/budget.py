@@ -164,9 +164,9 @@ def meet_budget(
 ) -> str:
     """Set the knobs of a trained predictor to the cheapest setting that meets a budget, and say why in a sentence.
 
-    With a limit of the run time, the best of the settings within the limit is found, and of the settings that are as
-    good, the fastest is taken (`Bench.equals`, which compares batch by batch). With a limit of the error, it is the
-    fastest setting whose error on the validation samples is within the limit.
+    With a limit of the run time, the settings within the limit are compared. The fastest of those whose error is as low
+    as the lowest one, up to the standard error of the difference (`Bench.equals`), is chosen. With a limit of the
+    error, the fastest setting whose error on the validation samples is within the limit is chosen.
 
     Args:
         predictor: the predictor, in evaluation mode; its knobs are set.

@@ -56,8 +56,12 @@ def select_files(
 ) -> tuple[list[Path], list[Path]]:
     """Return the files to read, and the files left out because they are damaged; print which files are not read.
 
-    Three kinds of files are ignored: hidden files, files that are read together with another file (`Data.companions`),
-    and files (such as a README) with a suffix that the data set does not list, if no file with this suffix can be read.
+    Three kinds of files are ignored:
+    - hidden files,
+    - files that are read together with another file (`Data.companions`),
+    - files of other kinds, such as a README: the data set does not list their suffix, and no file with this suffix can
+      be read. If this holds for all files, none of them is ignored.
+
     A remaining file that cannot be read stays in the list and causes an error later, unless `config` contains
     `unreadable=skip` or `skip_unreadable`.
 

@@ -51,10 +51,10 @@ class Kinds:
 def scan(mesh: Mesh, kind: Kind, scanner: Scanner, random: Generator) -> Float[np.ndarray, "points 3"]:
     """Return the points of one simulated scan of a body, metres.
 
-    The points are uniform over the part of the surface that is not missing. In a scan of kind "partial", the points
-    behind a plane, or within a ball, or all points that face away from a camera at the body's height are missing
-    (points that an arm hides from the camera are not). A scan of kind "outliers" also has points of a patch of floor
-    and points anywhere around the body.
+    The points are uniform over the part of the surface that is not missing. A scan of kind "partial" lacks one of three
+    sets of points, chosen at random: the points behind a plane, those within a ball, or those on faces that are turned
+    away from a camera at the body's height. Points that an arm hides from this camera are kept. A scan of kind
+    "outliers" also has points of a patch of floor and points anywhere around the body.
     """
     stranger = int(scanner.strangers * scanner.points * random.random()) if kind == "outliers" else 0
     surface_sample = sample(mesh, scanner.points - stranger, random)

@@ -30,10 +30,11 @@ class QuantilesHead(DensityHead):
 
     The loss is the mean pinball loss of all quantiles times 2, in standard deviations of the target. With many levels
     it approaches the continuous ranked probability score (Gneiting & Raftery 2007). The quantiles cannot cross: the raw
-    parameters are the middle quantile and the distances to the next ones. `calibrate` moves each quantile by a multiple
-    of the distance of the outermost ones, such that at least the stated share of the validation split lies below it
-    (conformalised quantile regression, Romano, Patterson & Candès 2019, for each quantile). The moved quantiles are
-    sorted (Chernozhukov, Fernández-Val & Galichon 2010).
+    parameters are the middle quantile and the distances to the next ones. `calibrate` moves each quantile, so
+    that at least the stated share of the validation split lies below it (conformalised quantile regression, Romano,
+    Patterson & Candès 2019, for each quantile). The step of a quantile, divided by the distance from the lowest to the
+    highest quantile, is the same for all samples. The moved quantiles are sorted (Chernozhukov, Fernández-Val &
+    Galichon 2010).
 
     Args:
         levels: number of quantiles K, odd; their probabilities are k/(K + 1).
