@@ -13,7 +13,14 @@ from framework.errors import ConfigError
 from framework.metric import HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
-from plugins.metric.risk_coverage.functional import area, at_coverage, curve
+from plugins.metric.risk_coverage.functional import (
+    area,
+    areas_without_each,
+    at_coverage,
+    curve,
+    error_at_coverage,
+    jackknife_error,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,7 +44,9 @@ class RiskCoverage(Metric, HasFigure):
       successes.
     - `risk_80`, `risk_95`: risk of the most confident 80 % and 95 %.
 
-    Equally confident predictions count with their mean risk, so that their order has no effect.
+    Each also has a standard error over predictions, with the ending `_sem`: the areas by the jackknife, the other two
+    by their influence function. It is NaN for a single prediction. Equally confident predictions count with their mean
+    risk, so that their order has no effect.
 
     Args:
         confidence: "entropy" for minus the predictive entropy; "mode" for the (log-)probability of the mode.
@@ -90,7 +99,20 @@ class RiskCoverage(Metric, HasFigure):
             "risk_80": at_coverage(own_curve, 0.8),
             "risk_95": at_coverage(own_curve, 0.95),
         }
-        return {f"{name}{self.unit}": value for name, value in results.items()}
+        undefined = risk.new_tensor(torch.nan)
+        errors = {
+            "aurc": undefined,
+            "e_aurc": undefined,
+            "risk_80": error_at_coverage(confidence, risk, 0.8),
+            "risk_95": error_at_coverage(confidence, risk, 0.95),
+        }
+        if len(risk) > 1:
+            areas = areas_without_each(confidence, risk)
+            errors["aurc"] = jackknife_error(areas)
+            errors["e_aurc"] = jackknife_error(areas - areas_without_each(-risk, risk))
+        # a key in degrees is aurc_deg, and its standard error aurc_deg_sem
+        named = {f"{name}{self.unit}_sem": value for name, value in errors.items()}
+        return named | {f"{name}{self.unit}": value for name, value in results.items()}
 
     def figure(self, title: str, *, synthetic: bool) -> "Figure":
         from plugins.metric.risk_coverage.picture import risk_coverage

@@ -13,7 +13,14 @@ from framework.errors import UserError
 from framework.prediction import Prediction
 from framework.target import Target
 from framework.testing.metrics import Cardioid
-from plugins.metric.risk_coverage.functional import area, at_coverage, curve
+from plugins.metric.risk_coverage.functional import (
+    area,
+    areas_without_each,
+    at_coverage,
+    curve,
+    error_at_coverage,
+    jackknife_error,
+)
 from plugins.metric.risk_coverage.metric import RiskCoverage
 
 WIDE = torch.float64
@@ -39,6 +46,54 @@ def test_ties_are_averaged_over_every_order(pairs):
     actual = curve(torch.tensor(confidence), torch.tensor(risk))
     np.testing.assert_allclose(actual.numpy(), np.mean(curves, 0), rtol=1e-12, atol=1e-12)
     assert area(actual).item() == pytest.approx(np.mean(curves), rel=1e-12, abs=1e-12)
+
+
+@settings(deadline=None, max_examples=150)
+@given(st.lists(st.tuples(st.integers(-2, 2), st.floats(0, 4)), min_size=2, max_size=12))
+def test_leaving_one_out_equals_the_curve_of_the_others(pairs):
+    confidence, risk = (torch.tensor(column, dtype=WIDE) for column in zip(*pairs, strict=True))
+    actual = areas_without_each(confidence, risk)
+    others = [torch.arange(len(risk)) != number for number in range(len(risk))]
+    expected = torch.stack([area(curve(confidence[mask], risk[mask])) for mask in others])
+    torch.testing.assert_close(actual, expected, rtol=1e-10, atol=1e-10)
+
+
+def test_ties_at_the_quantile_count_with_a_share():
+    risk = torch.randn(400, generator=torch.Generator().manual_seed(0), dtype=WIDE)
+    equal = error_at_coverage(torch.zeros(400), risk, 0.8)
+    # the mean over 80 % of ties is, by its definition, that of all
+    assert equal == pytest.approx(risk.std().item() / 20, rel=1e-12)
+
+
+def test_standard_errors_are_those_of_repeated_draws():
+    generator = torch.Generator().manual_seed(0)
+
+    def draw():
+        confidence = torch.randn(150, generator=generator, dtype=WIDE)
+        wrong = torch.rand(150, generator=generator, dtype=WIDE) < torch.sigmoid(-1 - 2 * confidence)
+        return confidence, wrong.double()
+
+    names = ("aurc", "e_aurc", "risk_80", "risk_95")
+    values = {name: [] for name in (*names, *(f"{name}_sem" for name in names))}
+    for _ in range(2000):
+        metric = RiskCoverage(CLASSES)
+        confidence, risk = draw()
+        metric.confidences.append(confidence)
+        metric.risks.append(risk)
+        metric._update_count = 1
+        for name, value in metric.compute().items():
+            values[name].append(value.item())
+    for name in names:
+        tolerance = 0.05 if name == "aurc" else 0.1
+        assert np.mean(values[f"{name}_sem"]) == pytest.approx(np.std(values[name]), rel=tolerance), name
+
+
+def test_errors_of_few_predictions_are_unknown():
+    assert jackknife_error(torch.zeros(1)).isnan()
+    _, actual = compute_metric(
+        CLASSES, Categorical(logits=torch.zeros(1, 3)), torch.zeros(1, dtype=torch.int64)
+    )
+    assert all(math.isnan(actual[name]) == name.endswith("_sem") for name in actual)
 
 
 @pytest.mark.parametrize(
