@@ -16,6 +16,7 @@ from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.intervals import DRAWS, Interval, central_interval
 from framework.distributions.noise import Draw
 from framework.distributions.protocol import Estimate, ValueSet, estimate, images, marginal, median
+from framework.distributions.unchanged import outlier_score
 from framework.errors import DataError
 from framework.target import Target
 
@@ -172,7 +173,8 @@ def true_image(batch: Batch, channel: str) -> Tensor:
 def table_columns(target: Target, prediction: Prediction) -> dict[str, Tensor]:
     """Return the columns of a table of predictions, (batch,) each, in the user's names and units; angles in degrees.
 
-    For images it returns the entropy only, because images are stored beside the table.
+    For images it returns no point prediction, because images are stored beside the table. Densities with an outlier
+    score (`unchanged.outlier_score`) have a column for it.
     """
     if target.kind == "image":
         columns = {}
@@ -181,7 +183,9 @@ def table_columns(target: Target, prediction: Prediction) -> dict[str, Tensor]:
         columns = {f"p_{name}": shares[:, label] for label, name in enumerate(target.names)}
     else:
         columns = named_columns(target, prediction.point)
-    return {**columns, "entropy_nats": prediction.entropy}
+    columns = {**columns, "entropy_nats": prediction.entropy}
+    score = outlier_score(prediction.density)
+    return columns if score is None else {**columns, "outlier_score": score}
 
 
 def named_columns(target: Target, values: Tensor, of: str = "") -> dict[str, Tensor]:

@@ -208,6 +208,7 @@ NOT_IN_THE_THESIS = {
     "metric/risk_coverage",
     "uncertainty/batch_ensemble",
     "uncertainty/conformal",
+    "uncertainty/feature_score",
     "uncertainty/folds",
     "uncertainty/laplace",
     "uncertainty/swag",

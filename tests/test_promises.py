@@ -36,6 +36,7 @@ CHAINS = {
     "laplace": "[laplace,conformal]",
     "swag": "[swag,conformal]",
     "batch_ensemble": "[batch_ensemble,conformal]",
+    "feature_score": "[feature_score,conformal]",
 }
 """Wrappers, each inside the wrapper for conformal prediction sets."""
 ELSEWHERE = {"refined"}
@@ -51,6 +52,7 @@ OFTEN = {
     "laplace": ("degrees",),
     "swag": ("real",),
     "batch_ensemble": ("class",),
+    "feature_score": ("class",),
 }
 """Kinds of targets that are always tested for each wrapper; the other kinds are slow tests."""
 SHORT = {
@@ -101,7 +103,8 @@ def trained(framework: Framework, table: Path, kind: str, chain: str) -> Done:
 
 def drawn(kind: str, wrapper: str) -> bool:
     """Return whether sizes are volumes that are estimated from draws: those of mixtures of several numbers."""
-    return kind == "several reals" and wrapper not in ("conformal", "temperature", "platt")
+    exact = ("conformal", "temperature", "platt", "feature_score")
+    return kind == "several reals" and wrapper not in exact
 
 
 def test_every_wrapper_is_asked() -> None:

@@ -11,6 +11,8 @@ from torchmetrics.utilities.data import dim_zero_cat
 from framework.distributions.checks import refuse_nan
 from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.model_mixtures import expected_entropy
+from framework.distributions.unchanged import outlier_score
+from framework.errors import ConfigError
 from framework.metric import Metric
 from framework.prediction import Prediction, Split
 
@@ -33,9 +35,11 @@ class OutOfDistribution(Metric):
         score: score that is high on outliers. "entropy" is the entropy of the density. "confidence" is the negative
             confidence: the confidence is the largest probability for classes (Hendrycks & Gimpel 2017), and the
             log-density at the mode for other targets. "mutual_information" is that of target and model, 0 for a single
-            model (Depeweg et al. 2018; framework.distributions.model_mixtures).
+            model (Depeweg et al. 2018; framework.distributions.model_mixtures). "outlier_score" is the score of the
+            input that a wrapper adds to the density (framework.distributions.unchanged).
 
     Raises:
+        ConfigError: the densities have no outlier score, which `score` requests.
         UserError: entropies or scores are NaN.
     """
 
@@ -56,7 +60,9 @@ class OutOfDistribution(Metric):
     test: list[Tensor] | Tensor
     outliers: list[Tensor] | Tensor
 
-    def __init__(self, *, score: Literal["entropy", "confidence", "mutual_information"] = "entropy") -> None:
+    def __init__(
+        self, *, score: Literal["entropy", "confidence", "mutual_information", "outlier_score"] = "entropy"
+    ) -> None:
         super().__init__()
         self.score = score
         # (entropy, score) of each sample; rankings require all samples
@@ -76,6 +82,8 @@ class OutOfDistribution(Metric):
                 expected_entropy(prediction.density).double(), f"expected entropies of {where}"
             )
             score = torch.where(entropy == expected, 0.0, entropy - expected)
+        if self.score == "outlier_score":
+            score = refuse_nan(required_score(prediction.density), f"outlier scores of {where}")
         collected = self.outliers if prediction.split == "outliers" else self.test
         assert isinstance(collected, list)
         collected.append(torch.stack([entropy, score], -1))
@@ -91,6 +99,22 @@ class OutOfDistribution(Metric):
             "entropy_test": test[:, 0].mean(),
             **ranking(outliers[:, 1], test[:, 1]),
         }
+
+
+def required_score(density: Distribution) -> Float64[Tensor, "batch"]:
+    """Return the outlier score of the input of each density.
+
+    Raises:
+        ConfigError: the densities have no such score.
+    """
+    score = outlier_score(density)
+    if score is None:
+        raise ConfigError(
+            "metric.out_of_distribution.score=outlier_score ranks samples by a score that a wrapper adds to the "
+            "density, but these densities have no such score. Choose a wrapper that computes one, such as "
+            "uncertainty=[feature_score], as the last of the list, or choose another score."
+        )
+    return score.double()
 
 
 def uncertainty_score(density: Distribution) -> Float64[Tensor, "batch"]:

@@ -9,11 +9,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from framework.distributions.batch_shapes import Reshaped
 from framework.distributions.circular import Circular
-from framework.distributions.density import Mixture
 from framework.distributions.exported import Exported, exported
 from framework.distributions.protocol import ValueSet, mahalanobis, marginal, value_set
+from framework.distributions.unchanged import Unchanged, outlier_score
 from framework.errors import ConfigError, UserError
 from plugins.uncertainty.conformal.highest_density import Ends, Line
 
@@ -32,7 +31,7 @@ The set of an overconfident density is larger than the region in which the densi
 """
 
 
-class PredictionSet(Mixture, ValueSet):
+class PredictionSet(Unchanged, ValueSet):
     """A density, unchanged to the last bit, and the set of values whose score is at most a threshold.
 
     A score is larger for a less expected value:
@@ -65,19 +64,10 @@ class PredictionSet(Mixture, ValueSet):
         score: Score,
         stated_probability: float | None = None,
     ) -> None:
-        self.density = density
         self.stated_probability = stated_probability
         self.threshold = threshold
         self.score: Score = score
-        # The dtype of log_prob: for classes that of one label's, otherwise that of an empty sample.
-        if torch.compiler.is_exporting():  # a trace reads the density's parameters alone, and draws nothing
-            like = torch.empty(0)
-        elif density.has_enumerate_support:
-            like = density.log_prob(density.enumerate_support()[0])
-        else:
-            like = density.sample(torch.Size((0,)))
-        shape = (*density.batch_shape, 1)
-        super().__init__(torch.zeros(shape, dtype=like.dtype, device=like.device), Reshaped(density, shape))
+        super().__init__(density)
 
     @torch.no_grad()
     def scores(self, value: Tensor) -> Float[Tensor, "*shape"]:
@@ -350,6 +340,11 @@ def _share_scores(log_prob: Tensor, log_draws: Float[Tensor, "draw *batch"]) -> 
 @value_set.register
 def _(density: PredictionSet) -> PredictionSet:
     return density
+
+
+@outlier_score.register
+def _(density: PredictionSet) -> Float[Tensor, "*batch"] | None:
+    return outlier_score(density.density)
 
 
 @marginal.register

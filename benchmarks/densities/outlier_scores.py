@@ -1,0 +1,243 @@
+"""Compare scores that recognise outliers: of the density, and of the features in front of the final layer.
+
+    python -m benchmarks.densities.outlier_scores measure moons
+    python -m benchmarks.densities.outlier_scores measure digits /path/to/digits /path/to/COIL20
+    python -m benchmarks.densities.outlier_scores page           # writes outlier_scores.md
+
+The digits are idx files as for `benchmarks.images.digits`, and COIL-20 is in the form of data=coil20. `measure` trains
+one model for each seed, and writes one line for each score and set of outliers into outlier_scores_runs.csv.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from statistics import mean, median, stdev
+from typing import Any
+
+from benchmarks.pages import machine, publish, read_rows
+from framework.reports.table import write_csv
+
+SEEDS = (0, 1, 2)
+KNOWN, UNKNOWN = tuple("01234567"), ("8", "9")
+"""Digits that train the model, and digits that are outliers."""
+SCORES: dict[str, dict[str, Any] | None] = {
+    "entropy": None,
+    "confidence": None,
+    "energy": {"method": "energy"},
+    "Mahalanobis": {},
+    "Mahalanobis, normalised": {"normalise": True},
+    "relative Mahalanobis": {"method": "relative_mahalanobis"},
+    "nearest neighbours": {"method": "knn"},
+    "nearest neighbours, not normalised": {"method": "knn", "normalise": False},
+}
+"""Scores by name: settings of `feature_score`, or None for scores of the density."""
+ROUNDS = 5
+"""Number of repetitions of a timed prediction."""
+TABLE = Path(__file__).with_name("outlier_scores_runs.csv")
+Batches = dict[str, Any]
+
+
+def load_moons(seed: int) -> tuple[Any, dict[str, Batches], dict[str, Any]]:
+    """Return data, one batch with all samples of each split, and inputs of outliers by name."""
+    data = prepared({"name": "moons", "data_seed": seed})
+    outliers = prepared({"name": "moons_outliers", "data_seed": seed})
+    return data, batches_of(data), {"far from both moons": batches_of(outliers)["test"]["input"]}
+
+
+def load_digits(seed: int, digits: Path, objects: Path) -> tuple[Any, dict[str, Batches], dict[str, Any]]:
+    """Return data, one batch with all samples of each split, and inputs of outliers by name."""
+    folder = {
+        "name": "image_folder",
+        "root": str(digits),
+        "image_size": 32,
+        "grayscale": True,
+        "data_seed": seed,
+    }
+    data = prepared({**folder, "classes": list(KNOWN)})
+    others = prepared({**folder, "classes": list(UNKNOWN)})
+    coil20 = prepared({"name": "coil20", "root": str(objects)})
+    outliers = {"digits 8 and 9": batches_of(others)["test"]["input"]}
+    return data, batches_of(data), {**outliers, "objects": batches_of(coil20)["test"]["input"]}
+
+
+def prepared(config: dict[str, Any]) -> Any:
+    """Return a prepared data set."""
+    from framework.configuration.schema import build, resolve
+
+    data = build("data", resolve("data", config))
+    data.prepare()
+    return data
+
+
+def batches_of(data: Any) -> dict[str, Batches]:
+    """Return one batch with all samples of each split."""
+    from framework.datasets.fields import fetch
+
+    return {name: fetch(part, range(len(part))) for name, part in data.splits()._asdict().items()}
+
+
+def train(data: Any, batches: dict[str, Batches], seed: int, encoder: dict[str, Any], epochs: int) -> Any:
+    """Return a model, trained by Adam with batches of 64 samples and half a cosine of the learning rate."""
+    import torch
+
+    from framework.configuration.assembly import build_predictor
+    from framework.configuration.schema import resolve
+
+    parts = {
+        "encoder": [resolve("encoder", encoder)],
+        "density_head": resolve("density_head", "categorical"),
+        "uncertainty": [],
+    }
+    model = build_predictor(parts, data.target, data.input_shape, seed).train()
+    optimizer = torch.optim.Adam(model.parameters(), lr=2e-3)
+    inputs, target = batches["train"]["input"], batches["train"]["target"]
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs * -(-len(inputs) // 64))
+    for _ in range(epochs):
+        for rows in torch.randperm(len(inputs)).split(64):
+            optimizer.zero_grad()
+            model.loss(inputs[rows], target[rows]).mean().backward()
+            optimizer.step()
+            schedule.step()
+    return model.eval()
+
+
+def measure(name: str, load: Callable[[int], Any], encoder: dict[str, Any], epochs: int) -> None:
+    """Record the AUROC of each score, with the accuracy of the model and processor times, in place of old records."""
+    import torch
+
+    torch.set_num_threads(1)
+    old = read_rows(TABLE) if TABLE.exists() else []
+    rows: list[dict[str, Any]] = [row for row in old if row["data"] != name]
+    for seed in SEEDS:
+        data, batches, outliers = load(seed)
+        model = train(data, batches, seed, encoder, epochs)
+        for row in test(model, data, batches, outliers):
+            rows.append({"data": name, "seed": seed, **row})
+    write_csv(rows, None, TABLE)
+
+
+def test(
+    model: Any, data: Any, batches: dict[str, Batches], outliers: dict[str, Any]
+) -> Iterator[dict[str, Any]]:
+    """Yield the results of each score on each set of outliers."""
+    import torch
+
+    from framework.configuration.schema import build, resolve
+    from framework.distributions.unchanged import outlier_score
+    from framework.uncertainty import reading_training
+    from plugins.metric.out_of_distribution.metric import ranking, uncertainty_score
+
+    known, label = batches["test"]["input"], batches["test"]["target"]
+    with torch.no_grad():
+        accuracy = (model(known).mode == label).double().mean().item()
+    for name, config in SCORES.items():
+        predictor = model
+        if config is not None:
+            part = resolve("uncertainty", {"name": "feature_score", **config})
+            predictor = build("uncertainty", part, model=lambda: model, target=data.target).eval()
+            with reading_training(predictor, [batches["train"]]):
+                predictor.calibrate([batches["validation"]])
+
+        @torch.no_grad()
+        def score(inputs: Any, predictor: Any = predictor, name: str = name) -> Any:
+            density = predictor(inputs)
+            if name == "entropy":
+                return density.entropy().double()
+            return uncertainty_score(density) if name == "confidence" else outlier_score(density)
+
+        times = []
+        for _ in range(ROUNDS):
+            start = time.process_time()
+            of_known = score(known)
+            times.append((time.process_time() - start) / len(known) * 1e6)
+        for kind, inputs in outliers.items():
+            ranks = ranking(score(inputs), of_known)
+            numbers = {key: ranks[key].item() for key in ("auroc", "fpr95")}
+            cost = {"microseconds": median(times), "accuracy": accuracy}
+            yield {"score": name, "outliers": kind, **numbers, **cost}
+
+
+def page() -> None:
+    """Write the page from the recorded runs."""
+    rows: list[dict[str, Any]] = read_rows(TABLE)
+    lines = [
+        "# Scores that recognise outliers",
+        "",
+        "This page compares scores that should be high for inputs unlike the training data. `entropy` and `confidence` "
+        "are computed from the predicted density, and all others from the features that the final layer reads "
+        "(`uncertainty=[feature_score]`). AUROC is the probability that a random outlier has a higher score than a "
+        "random test sample; FPR95 is the share of test samples that a threshold classifies as outliers if it detects "
+        f"95 % of the outliers. The numbers are means over {len(SEEDS)} seeds (of training and, for moons and digits, "
+        "of data or split), and ± is the standard deviation over seeds. Settings are the defaults of "
+        "`feature_score`, except where the name of the score says otherwise; none was tuned.",
+    ]
+    for data, heading in (
+        ("moons", "Moons (synthetic)"),
+        ("digits", f"Handwritten digits {KNOWN[0]} to {KNOWN[-1]} (real)"),
+    ):
+        own: list[dict[str, Any]] = [row for row in rows if row["data"] == data]
+        if not own:
+            continue
+        accuracies = [row["accuracy"] for row in own if row["score"] == "entropy"]
+        texts = {
+            "moons": "The outliers lie far from both moons, on one side (`data=moons_outliers`). The network has two "
+            "layers of 512 units.",
+            "digits": "A small convolutional network (`biternion_vgg`) is trained on the digits 0 to 7 among the "
+            "10,000 test images of MNIST, split at random. Outliers are digits of the other two classes, 8 and 9, "
+            "and images of objects (COIL-20).",
+        }
+        lines += [
+            "",
+            f"## {heading}",
+            "",
+            f"{texts[data]} The accuracy of the classes is {spread(accuracies)}. Times are processor times of density "
+            "and score for a row, in a batch with the whole test split, as medians of "
+            f"{ROUNDS} repetitions.",
+        ]
+        for kind in dict.fromkeys(row["outliers"] for row in own):
+            lines += ["", f"Outliers: {kind}", "", *table([row for row in own if row["outliers"] == kind])]
+    lines += [
+        "",
+        f"{machine('torch')} Commands: the lines at the top of `benchmarks/densities/outlier_scores.py`. Other "
+        "programs used the machine at the same time.",
+        "",
+    ]
+    publish(__file__, "\n".join(lines))
+
+
+def table(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the lines of a table of scores, the best first."""
+    lines = []
+    for score in SCORES:
+        own = [row for row in rows if row["score"] == score]
+        auroc, fpr = ([row[key] for row in own] for key in ("auroc", "fpr95"))
+        cost = mean(row["microseconds"] for row in own)
+        lines.append((mean(auroc), f"| {score} | {spread(auroc)} | {spread(fpr)} | {cost:.3g} |"))
+    head = ["| score | AUROC | FPR95 | µs / row |", "|---|---:|---:|---:|"]
+    return [*head, *(line for _, line in sorted(lines, key=lambda pair: -pair[0]))]
+
+
+def spread(values: Sequence[float]) -> str:
+    """Return the mean and the standard deviation."""
+    return f"{mean(values):.3f} ± {stdev(values):.3f}"
+
+
+def main() -> None:
+    """Run the command of the command line."""
+    parser = argparse.ArgumentParser(description="Compare scores that recognise outliers.")
+    parser.add_argument("step", choices=("measure", "page"))
+    parser.add_argument("set", choices=("moons", "digits"), nargs="?")
+    parser.add_argument("folders", type=Path, nargs="*", help="folders of the digits and of COIL-20")
+    options = parser.parse_args()
+    if options.step == "page":
+        page()
+    elif options.set == "moons":
+        measure("moons", load_moons, {"name": "mlp", "widths": [512, 512]}, 100)
+    else:
+        encoder = {"name": "biternion_vgg", "convolution_dropout": 0.0, "dropout": 0.1}
+        measure("digits", lambda seed: load_digits(seed, *options.folders), encoder, 3)
+
+
+if __name__ == "__main__":
+    main()
