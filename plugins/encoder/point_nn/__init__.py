@@ -1,0 +1,1 @@
+"""Point-NN: an encoder of clouds that has no parameters."""
