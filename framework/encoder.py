@@ -4,6 +4,7 @@ import math
 from abc import ABC, abstractmethod
 from typing import ClassVar
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -92,3 +93,27 @@ def require_numbers(input_shape: tuple[int, ...], by: str) -> int:
             "Check the samples of `data`, or the encoder before this one."
         )
     return length
+
+
+def require_grey_or_color(input_shape: tuple[int, ...], by: str, smallest: int = 0) -> None:
+    """Require grey or colour images, with sides of at least `smallest` pixels.
+
+    Raises:
+        ConfigError: the input is not an image of 1 or 3 channels, or it is too small.
+    """
+    if len(input_shape) != 3 or input_shape[0] not in (1, 3):
+        raise ConfigError(
+            f"{by} reads images of shape (1 or 3 channels, height, width), but got an input of shape {input_shape}. "
+            "Choose another encoder for this input, such as `mlp`."
+        )
+    if min(input_shape[1:]) < smallest:
+        raise ConfigError(
+            f"{by} needs images of at least {smallest} × {smallest} pixels, but got images of {input_shape[1]} × "
+            f"{input_shape[2]}. Make the images larger, or choose `biternion_vgg`."
+        )
+
+
+def images_in_unit_range(inputs: Tensor, dtype: torch.dtype) -> Float[Tensor, "batch channels height width"]:
+    """Return images with values from 0 to 1 in a dtype, channels last in memory; integers are divided by 255."""
+    images = inputs.to(dtype, memory_format=torch.channels_last)
+    return images if inputs.is_floating_point() else images / 255

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
-from framework.encoder import Encoder
+from framework.encoder import Encoder, images_in_unit_range, require_grey_or_color
 from framework.errors import ConfigError
 
 Channels = Annotated[int, Field(gt=0)]
@@ -48,11 +48,7 @@ class BiternionVGG(Encoder):
         dropout: Annotated[float, Field(ge=0, lt=1)] = 0.5,
     ) -> None:
         super().__init__()
-        if len(input_shape) != 3 or input_shape[0] not in (1, 3):
-            raise ConfigError(
-                "biternion_vgg reads images of shape (1 or 3 channels, height, width), but got an input of shape "
-                f"{input_shape}. Choose another encoder for this input, such as `mlp`."
-            )
+        require_grey_or_color(input_shape, by="biternion_vgg")
         pooled = range(1, len(channels) - 1, 2)
         planes, *sides = input_shape
         layers: list[nn.Module] = []
@@ -79,10 +75,7 @@ class BiternionVGG(Encoder):
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch features"]:
         """Return the features of the images."""
-        dtype = self.fully_connected.weight.dtype
-        images = inputs.to(dtype, memory_format=torch.channels_last)
-        if not inputs.is_floating_point():
-            images = images / 255
+        images = images_in_unit_range(inputs, self.fully_connected.weight.dtype)
         flat = self.convolution_dropout(self.convolutions(images)).flatten(1)
         return self.dropout(self.fully_connected(flat).relu())
 

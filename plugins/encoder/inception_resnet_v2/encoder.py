@@ -8,8 +8,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from framework.configuration.paths import FilePath
-from framework.encoder import Encoder
-from framework.errors import ConfigError
+from framework.encoder import Encoder, images_in_unit_range, require_grey_or_color
 from framework.storage.weights import fill_from_file
 from plugins.encoder.inception_resnet_v2.layers import (
     ConvNorm,
@@ -54,16 +53,7 @@ class InceptionResNetV2(Encoder):
         dropout: Annotated[float, Field(ge=0, lt=1)] = 0.2,
     ) -> None:
         super().__init__()
-        if len(input_shape) != 3 or input_shape[0] not in (1, 3):
-            raise ConfigError(
-                "inception_resnet_v2 reads images of shape (1 or 3 channels, height, width), but got an input of "
-                f"shape {input_shape}. Choose another encoder for this input, such as `mlp`."
-            )
-        if min(input_shape[1:]) < SMALLEST:
-            raise ConfigError(
-                f"inception_resnet_v2 needs images of at least {SMALLEST} × {SMALLEST} pixels, but got images of "
-                f"{input_shape[1]} × {input_shape[2]}. Make the images larger, or choose `biternion_vgg`."
-            )
+        require_grey_or_color(input_shape, by="inception_resnet_v2", smallest=SMALLEST)
         self.conv2d_1a = ConvNorm(3, 32, 3, stride=2, padding="valid")
         self.conv2d_2a = ConvNorm(32, 32, 3, padding="valid")
         self.conv2d_2b = ConvNorm(32, 64, 3)
@@ -87,9 +77,7 @@ class InceptionResNetV2(Encoder):
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch 1536"]:
         """Return the features of the images."""
-        images = inputs.to(self.conv2d_7b.conv.weight.dtype, memory_format=torch.channels_last)
-        if not inputs.is_floating_point():
-            images = images / 255
+        images = images_in_unit_range(inputs, self.conv2d_7b.conv.weight.dtype)
         maps = (images * 2 - 1).expand(-1, 3, -1, -1)  # (x - mean 0.5) / deviation 0.5
         *layers, dropout = self.children()  # in the order of the constructor
         for layer in layers:

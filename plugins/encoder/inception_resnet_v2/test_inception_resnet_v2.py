@@ -1,5 +1,3 @@
-import hashlib
-
 import numpy as np
 import pytest
 import torch
@@ -7,29 +5,9 @@ from torch import nn
 
 from framework.configuration.schema import build, resolve
 from framework.errors import CheckpointError, ConfigError
+from framework.testing.named_weights import hash_names_and_shapes, weights_of_names
 from plugins.encoder.inception_resnet_v2.encoder import InceptionResNetV2
 from plugins.encoder.inception_resnet_v2.layers import ConvNorm, Residual, mixed_5b
-
-
-def make_weights(state):
-    """Return weights that depend only on the order of their names and on their shapes."""
-    generator, weights = np.random.default_rng(0), {}
-    for name in sorted(state):
-        shape = tuple(state[name].shape)
-        if name.endswith("num_batches_tracked"):
-            weights[name] = torch.tensor(0)
-            continue
-        values = generator.normal(size=shape)
-        if name.endswith("running_var"):
-            values = np.exp(values / 2)
-        elif name.endswith("bn.weight"):
-            values = 1 + values / 4
-        elif len(shape) == 4:
-            values = values * np.sqrt(2 / np.prod(shape[1:]))
-        else:
-            values = values / 4
-        weights[name] = torch.tensor(values, dtype=torch.float32)
-    return weights
 
 
 @pytest.fixture(scope="module")
@@ -40,11 +18,9 @@ def encoder():
 
 
 def test_names_and_shapes_are_timms(encoder):
-    state = encoder.state_dict()
-    text = "\n".join(f"{name} {tuple(tensor.shape)}" for name, tensor in sorted(state.items()))
     # computed from timm 1.0.31's inception_resnet_v2 without classif.*
     assert (
-        hashlib.sha256(text.encode()).hexdigest()
+        hash_names_and_shapes(encoder.state_dict())
         == "b89cce2f5e335169473effef31dffea2f11dc7e368e9a39fe5b6b8c2eef27b5f"
     )
 
@@ -58,7 +34,7 @@ def test_parameters_are_as_published(encoder):
 
 def test_features_are_timms_from_a_weight_file(encoder, tmp_path):
     file = tmp_path / "weights.pth"
-    weights = make_weights(encoder.state_dict()) | {
+    weights = weights_of_names(encoder.state_dict()) | {
         "classif.weight": torch.zeros(1000, 1536),
         "classif.bias": torch.zeros(1000),
     }

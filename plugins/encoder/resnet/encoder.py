@@ -7,8 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from framework.configuration.paths import FilePath
-from framework.encoder import Encoder
-from framework.errors import ConfigError
+from framework.encoder import Encoder, images_in_unit_range, require_grey_or_color
 from framework.storage.weights import fill_from_file
 
 SMALLEST = 32
@@ -56,16 +55,7 @@ class ResNet(Encoder):
         frozen: bool = False,
     ) -> None:
         super().__init__()
-        if len(input_shape) != 3 or input_shape[0] not in (1, 3):
-            raise ConfigError(
-                "resnet reads images of shape (1 or 3 channels, height, width), but got an input of shape "
-                f"{input_shape}. Choose another encoder for this input, such as `mlp`."
-            )
-        if min(input_shape[1:]) < SMALLEST:
-            raise ConfigError(
-                f"resnet needs images of at least {SMALLEST} × {SMALLEST} pixels, but got images of {input_shape[1]} × "
-                f"{input_shape[2]}. Make the images larger, or choose `biternion_vgg`."
-            )
+        require_grey_or_color(input_shape, by="resnet", smallest=SMALLEST)
         self.fixed = frozen
         self.register_buffer("mean", torch.tensor(MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("deviation", torch.tensor(DEVIATION).view(3, 1, 1), persistent=False)
@@ -106,9 +96,7 @@ class ResNet(Encoder):
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch features"]:
         """Return the features of the images."""
-        images = inputs.to(self.conv1.weight.dtype, memory_format=torch.channels_last)
-        if not inputs.is_floating_point():
-            images = images / 255
+        images = images_in_unit_range(inputs, self.conv1.weight.dtype)
         maps = self.maxpool(self.bn1(self.conv1((images - self.mean) / self.deviation)).relu())
         for stage in range(4):
             maps = self.get_submodule(f"layer{stage + 1}")(maps)

@@ -1,13 +1,12 @@
 """Tests against torchvision's networks, with weights that depend only on their names and shapes."""
 
-import hashlib
-
 import numpy as np
 import pytest
 import torch
 
 from framework.configuration.schema import build, resolve
 from framework.errors import CheckpointError, ConfigError
+from framework.testing.named_weights import hash_names_and_shapes, weights_of_names
 
 NAMES = {
     18: "504739f3083bec5ee0755e2a89f10f73ea11987f4523e1732347283251361313",
@@ -30,7 +29,7 @@ FEATURES = {
         [3316.7428191543, 3035.5406458250, 345.5347022303, 1692.6446210317],
     ),
 }
-"""Mean, deviation and four features of the first image, of torchvision 0.28 with `make_weights` in float64."""
+"""Mean, deviation and four features of the first image, of torchvision 0.28 with `weights_of_names` in float64."""
 
 
 def encoder(size=(3, 70, 45), **config):
@@ -38,30 +37,10 @@ def encoder(size=(3, 70, 45), **config):
     return build("encoder", resolve("encoder", {"name": "resnet", **config}), input_shape=size)
 
 
-def make_weights(state):
-    generator, weights = np.random.default_rng(0), {}
-    for name in sorted(state):
-        shape = tuple(state[name].shape)
-        if name.endswith("num_batches_tracked"):
-            weights[name] = torch.tensor(0)
-            continue
-        values = generator.normal(size=shape)
-        if name.endswith("running_var"):
-            values = np.exp(values / 2)
-        elif len(shape) == 1:
-            values = 0.25 * values + ("weight" in name)
-        else:
-            values = values * np.sqrt(2 / np.prod(shape[1:]))
-        weights[name] = torch.tensor(values, dtype=torch.float32)
-    return weights
-
-
 @pytest.mark.parametrize("depth", [18, 34, 50, 101])
 def test_names_shapes_and_number_of_weights_are_torchvisions(depth):
     network = encoder(depth=depth)
-    state = network.state_dict()
-    text = "\n".join(f"{name} {tuple(tensor.shape)}" for name, tensor in sorted(state.items()))
-    assert hashlib.sha256(text.encode()).hexdigest() == NAMES[depth]
+    assert hash_names_and_shapes(network.state_dict()) == NAMES[depth]
     classifier = 1000 * (network.output_shape[0] + 1)
     assert sum(parameter.numel() for parameter in network.parameters()) + classifier == PARAMETERS[depth]
 
@@ -70,7 +49,7 @@ def test_names_shapes_and_number_of_weights_are_torchvisions(depth):
 @pytest.mark.parametrize("frozen", [False, True])
 def test_features_are_torchvisions_from_a_weight_file(depth, frozen, tmp_path):
     file = tmp_path / "weights.pth"
-    weights = make_weights(encoder(depth=depth).state_dict())
+    weights = weights_of_names(encoder(depth=depth).state_dict())
     torch.save(weights | {"fc.weight": torch.zeros(1000, 512), "fc.bias": torch.zeros(1000)}, file)
     network = encoder(depth=depth, weights=str(file), frozen=frozen)
     images = torch.tensor(np.random.default_rng(1).uniform(size=(2, 3, 70, 45)), dtype=torch.float32)
@@ -95,6 +74,6 @@ def test_what_cannot_be_read_is_refused(tmp_path):
         encoder((16,))
     with pytest.raises(ConfigError, match="at least 32 × 32"):
         encoder((3, 31, 64))
-    torch.save(make_weights(encoder(depth=34).state_dict()), tmp_path / "deep.pth")
+    torch.save(weights_of_names(encoder(depth=34).state_dict()), tmp_path / "deep.pth")
     with pytest.raises(CheckpointError, match=r"does not fit ResNet: .*layer"):
         encoder(depth=18, weights=str(tmp_path / "deep.pth"))
