@@ -1,5 +1,6 @@
 """Input and output of a U-Net: reading images, restricting computation to the subject's box, computing colours."""
 
+from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -9,6 +10,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 from torch.nn import functional
 
+from framework.encoder import Encoder
 from framework.errors import ConfigError
 from framework.storage.processor import fast_bfloat16
 from plugins.encoder.unets.layers import Layer, Step, convolve
@@ -189,6 +191,31 @@ class Canvas:
         return (
             torch.bfloat16 if self.precision == "bfloat16" or fast_bfloat16(weight.device) else torch.float32
         )
+
+
+class CroppedUNet(Encoder):
+    """Base class of the U-Nets, which compute only the subject's box in evaluation.
+
+    Attributes:
+        layers: layers of the network, in the order in which `maps` uses them.
+        head: last convolution.
+        canvas: settings of the input and the output.
+        report: areas of the images of the last batch that evaluation computed; None after training, and without crop.
+    """
+
+    layers: nn.ModuleList
+    head: nn.Conv2d
+    canvas: Canvas
+    report: CropReport | None = None
+
+    @abstractmethod
+    def maps(self, images: Tensor, layers: Iterator[Step]) -> Tensor:
+        """Return the maps that the last convolution reads (see `Maps`)."""
+
+    def forward(self, inputs: Tensor) -> Float[Tensor, "batch outputs height width"]:
+        """Return colours and scales of the images."""
+        outputs, self.report = self.canvas.compute(inputs, self.maps, self.layers, self.head, self.training)
+        return outputs
 
 
 def subject_box(image: Float[Tensor, "channels height width"], stride: int, margin: int) -> Box | None:

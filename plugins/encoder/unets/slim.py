@@ -10,14 +10,13 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from framework.encoder import Encoder
-from plugins.encoder.unets.canvas import Canvas, CropReport, Precision, build_head, require_images
+from plugins.encoder.unets.canvas import Canvas, CroppedUNet, Precision, build_head, require_images
 from plugins.encoder.unets.layers import Layer, Normalisation, Step
 
 Channels = Annotated[int, Field(gt=0)]
 
 
-class Slim(Encoder):
+class Slim(CroppedUNet):
     """A small U-Net that first rearranges squares of `unshuffle`² pixels as channels (the inverse of Shi et al. 2016).
 
     Each level has one 3×3 convolution on the way down and one on the way up. A 2×2 convolution of stride 2 leads to the
@@ -33,16 +32,11 @@ class Slim(Encoder):
         unshuffle: side of a square, pixels.
         normalisation, colors, scales, crop, precision, residual: as in `unet.UNet`.
 
-    Attributes:
-        report: areas of the images of the last batch that evaluation computed; None after training, and without crop.
-
     Raises:
         ConfigError: the input is not an image, or `crop` with `normalisation="group"`.
     """
 
     bibtex = "shi2016realtime"
-
-    report: CropReport | None = None
 
     # More than eight parameters: each keyword is a config key that a user sets alone.
     def __init__(
@@ -87,11 +81,6 @@ class Slim(Encoder):
         for same_size in reversed(across[:-1]):
             maps = functional.interpolate(next(layers)(maps), scale_factor=2.0) + same_size
         return next(layers)(maps)
-
-    def forward(self, inputs: Tensor) -> Float[Tensor, "batch outputs height width"]:
-        """Return colours and scales of the images."""
-        outputs, self.report = self.canvas.compute(inputs, self.maps, self.layers, self.head, self.training)
-        return outputs
 
 
 def unshuffle_pixels(images: Float[Tensor, "batch channels height width"], side: int) -> Tensor:

@@ -9,12 +9,11 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from framework.encoder import Encoder
-from plugins.encoder.unets.canvas import Canvas, CropReport, Precision, build_head, require_images
+from plugins.encoder.unets.canvas import Canvas, CroppedUNet, Precision, build_head, require_images
 from plugins.encoder.unets.layers import Layer, Normalisation, Step
 
 
-class UNet(Encoder):
+class UNet(CroppedUNet):
     """Five levels of two 3×3 convolutions each, with skip connections (thesis §7.3.2; Ronneberger et al. 2015).
 
     Max-pooling leads to the next lower level. Bilinear interpolation and a 3×3 convolution lead to the next upper
@@ -38,16 +37,11 @@ class UNet(Encoder):
         residual: whether the network's output is added to the input's first `colors` channels, which are colours of a
             rasterised mesh. Before training the output is then the input. Colours may lie a little beyond [0, 1].
 
-    Attributes:
-        report: areas of the images of the last batch that evaluation computed; None after training, and without crop.
-
     Raises:
         ConfigError: the input is not an image, or `crop` with `normalisation="group"`.
     """
 
     bibtex = "prokudin2021smplpix, ronneberger2015unet"
-
-    report: CropReport | None = None
 
     # More than eight parameters: each keyword is a config key that a user sets alone.
     def __init__(
@@ -95,11 +89,6 @@ class UNet(Encoder):
             maps = next(layers)(maps)
             maps = next(layers)(maps)
         return maps
-
-    def forward(self, inputs: Tensor) -> Float[Tensor, "batch outputs height width"]:
-        """Return colours and scales of the images."""
-        outputs, self.report = self.canvas.compute(inputs, self.maps, self.layers, self.head, self.training)
-        return outputs
 
 
 def double_size(maps: Float[Tensor, "batch channels height width"]) -> Tensor:
