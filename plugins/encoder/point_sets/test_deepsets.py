@@ -3,10 +3,9 @@ import pytest
 import torch
 
 from framework.configuration.schema import build, resolve
-from framework.errors import ConfigError
 from framework.geometry.clouds import pad
 from plugins.encoder.point_sets.deepsets import DeepSets, below_largest
-from plugins.encoder.point_sets.test_pointnet2 import read_points
+from plugins.encoder.point_sets.test_pointnet2 import read_points, readings
 
 SMALL = {"channels": [8, 10, 12], "widths": [12, 8]}
 
@@ -36,9 +35,7 @@ def by_hand(encoder, cloud, activation):
 @pytest.mark.parametrize(
     "name, activation", [("tanh", np.tanh), ("elu", lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0))))]
 )
-@pytest.mark.parametrize(
-    "columns, config", [(3, {}), (6, {}), (6, {"attributes": True}), (3, {"points": 20})], ids=str
-)
+@pytest.mark.parametrize("columns, config", readings(points=20), ids=str)
 def test_agrees_with_numpy_on_clouds_of_any_size(name, activation, columns, config):
     encoder = build_encoder((50, columns), activation=name, **config)
     clouds = [torch.randn(number, columns) * 4 + 7 for number in (50, 2, 13, 30)]
@@ -69,17 +66,3 @@ def test_it_is_the_published_network():
     count = sum(parameter.numel() for parameter in DeepSets((5000, 3)).parameters()) + 257 * 40
     assert count == (4 * 256 + 3 * 257 * 256) + 257 * 40
     assert count == pytest.approx(2.1e5, rel=0.01)  # thesis Table 6.2
-
-
-def test_refuses_attributes_that_are_not_there():
-    with pytest.raises(ConfigError, match="the clouds have no such columns"):
-        DeepSets((100, 3), attributes=True)
-
-
-@pytest.mark.parametrize(
-    "config",
-    [{"channels": []}, {"widths": [0]}, {"activation": "relu"}, {"normalise": "ball"}, {"points": 0}],
-)
-def test_refuses_a_config_out_of_range(config):
-    with pytest.raises(ConfigError, match=r"encoder\."):
-        resolve("encoder", {"name": "deepsets", **config})

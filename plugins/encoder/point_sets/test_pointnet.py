@@ -1,13 +1,9 @@
-import math
-
 import pytest
 import torch
 
 from framework.configuration.schema import build, resolve
-from framework.errors import ConfigError
-from framework.geometry.clouds import pad
 from plugins.encoder.point_sets.pointnet import PointNet
-from plugins.encoder.point_sets.test_pointnet2 import apply_layers, read_points, require_agreement
+from plugins.encoder.point_sets.test_pointnet2 import apply_layers, read_points, readings, require_agreement
 
 SMALL = {"point_widths": [8, 10, 8, 12], "widths": [12, 8], "dropout": 0.0}
 
@@ -37,31 +33,11 @@ def by_hand(encoder, cloud):
 
 
 @pytest.mark.parametrize("variant", ["full", "vanilla"])
-@pytest.mark.parametrize(
-    "columns, config", [(3, {}), (6, {}), (6, {"attributes": True}), (3, {"points": 20})], ids=str
-)
+@pytest.mark.parametrize("columns, config", readings(points=20), ids=str)
 def test_agrees_with_numpy_on_clouds_of_any_size(variant, columns, config):
     encoder = build_encoder((50, columns), variant=variant, **config)
     clouds = [torch.randn(number, columns) * 4 + 7 for number in (50, 1, 13, 30)]
     require_agreement(encoder, clouds, by_hand)
-
-
-def test_padding_does_not_enter_the_moments_of_batch_norm():
-    clouds = [torch.randn(number, 3) for number in (9, 9, 9)]
-    encoder, other = build_encoder(), build_encoder()
-    encoder.train()(torch.stack(clouds))
-    other.train()(torch.cat([torch.stack(clouds), torch.full((3, 5, 3), math.nan)], 1))
-    for name, value in encoder.state_dict().items():
-        torch.testing.assert_close(other.state_dict()[name], value, msg=name)
-
-
-def test_few_clouds_at_a_time_give_what_all_at_once_give():
-    encoder = build_encoder((3000, 3))
-    clouds = pad([torch.randn(number, 3) for number in (3000, 2000, 2100, 10, 2999)])
-    whole = encoder(clouds)
-    with torch.no_grad():
-        torch.testing.assert_close(encoder(clouds), whole, rtol=1e-5, atol=1e-6)
-        assert encoder(clouds[:0]).shape == (0, 8)
 
 
 def test_it_is_the_published_network():
@@ -78,17 +54,3 @@ def test_matrices_begin_near_the_identity():
     matrices = encoder.input_matrix(points, counts)
     torch.testing.assert_close(matrices, torch.eye(3).expand(2, 3, 3), rtol=0, atol=0.05)
     assert not torch.equal(matrices[0], matrices[1])
-
-
-def test_refuses_attributes_that_are_not_there():
-    with pytest.raises(ConfigError, match="the clouds have no such columns"):
-        PointNet((100, 3), attributes=True)
-
-
-@pytest.mark.parametrize(
-    "config",
-    [{"point_widths": [4, 4]}, {"widths": []}, {"variant": "plain"}, {"normalise": "ball"}, {"points": 0}],
-)
-def test_refuses_a_config_out_of_range(config):
-    with pytest.raises(ConfigError, match=r"encoder\."):
-        resolve("encoder", {"name": "pointnet", **config})

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from framework.configuration.schema import build, resolve
-from framework.errors import ConfigError, DataError
+from framework.errors import DataError
 from framework.geometry.clouds import pad
 from plugins.encoder.point_sets.pointnet2 import PointNet2
 
@@ -47,6 +47,11 @@ def read_points(encoder, cloud):
     points[:, :3] -= points[:, :3].mean(0)
     points[:, :3] /= np.sqrt((points[:, :3] ** 2).sum(1)).max()
     return points[: encoder.reading.most, : encoder.reading.columns]
+
+
+def readings(points):
+    """Return the columns of clouds and the settings of what is read: coordinates, attributes, and the first points."""
+    return [(3, {}), (6, {}), (6, {"attributes": True}), (3, {"points": points})]
 
 
 def require_agreement(encoder, clouds, by_hand):
@@ -91,9 +96,7 @@ def by_hand(encoder, cloud, balls):
 
 
 @pytest.mark.parametrize("grouping", ["single_scale", "multi_scale"])
-@pytest.mark.parametrize(
-    "columns, config", [(3, {}), (6, {}), (6, {"attributes": True}), (3, {"points": 40})], ids=str
-)
+@pytest.mark.parametrize("columns, config", readings(points=40), ids=str)
 def test_agrees_with_numpy_on_clouds_of_any_size(grouping, columns, config):
     encoder = build_encoder((150, columns), grouping=grouping, **config)
     clouds = [torch.randn(number, columns) * 4 + 7 for number in (150, 2, 13, 30)]
@@ -187,24 +190,6 @@ def test_points_in_one_place_and_one_point_alone_are_the_same_cloud():
     torch.testing.assert_close(features, encoder(torch.zeros(1, 1, 3)))
 
 
-def test_padding_does_not_enter_the_moments_of_batch_norm():
-    clouds = [torch.randn(number, 3) for number in (9, 9, 9)]
-    encoder, other = build_encoder(), build_encoder()
-    encoder.train()(torch.stack(clouds))
-    other.train()(torch.cat([torch.stack(clouds), torch.full((3, 5, 3), math.nan)], 1))
-    for name, value in encoder.state_dict().items():
-        torch.testing.assert_close(other.state_dict()[name], value, msg=name)
-
-
-def test_few_clouds_at_a_time_give_what_all_at_once_give():
-    encoder = build_encoder((300, 3), grouping="multi_scale")
-    clouds = pad([torch.randn(number, 3) for number in (300, 20, 21, 10, 299)])
-    whole = encoder(clouds)
-    with torch.no_grad():
-        torch.testing.assert_close(encoder(clouds), whole, rtol=1e-5, atol=1e-6)
-        assert encoder(clouds[:0]).shape == (0, 32)
-
-
 def test_refuses_clouds_for_which_its_balls_mean_nothing():
     encoder = build_encoder(normalise="none", radius=0.2)
     clouds = torch.randn(3, 150, 3) / 3
@@ -212,24 +197,3 @@ def test_refuses_clouds_for_which_its_balls_mean_nothing():
     clouds[1] *= 100
     with pytest.raises(DataError, match=r"Cloud 1 of the batch extends to .* encoder pointnet2"):
         encoder(clouds)
-
-
-def test_refuses_attributes_that_are_not_there():
-    with pytest.raises(ConfigError, match="the clouds have no such columns"):
-        PointNet2((100, 3), attributes=True)
-
-
-@pytest.mark.parametrize(
-    "config",
-    [
-        {"grouping": "both"},
-        {"centroids": [8]},
-        {"radius": 0},
-        {"width": 0},
-        {"normalise": "ball"},
-        {"points": 0},
-    ],
-)
-def test_refuses_a_config_out_of_range(config):
-    with pytest.raises(ConfigError, match=r"encoder\."):
-        resolve("encoder", {"name": "pointnet2", **config})
