@@ -1,4 +1,4 @@
-"""The map from a raw parameter to a scale above 0 that several heads of real numbers share."""
+"""Scales of heads of real numbers: their map from raw parameters, and losses whose gradient they balance."""
 
 import torch
 from jaxtyping import Float
@@ -19,3 +19,20 @@ def scale_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     most = 4 * (LARGEST_SCALE**0.25 - 1)
     high = (1 + raw.clamp(0.0, most) / 4).square().square()
     return torch.where(raw < 0, torch.exp(raw.clamp(max=0.0)), high)
+
+
+def balance_losses(
+    losses: Float[Tensor, "*batch number"], scale: Float[Tensor, "*batch number"], balance: float
+) -> Float[Tensor, "*batch number"]:
+    """Return the losses of each number, whose gradient is multiplied by the number's scale to the power 2β.
+
+    This is the loss β-NLL of Seitzer et al. 2022, except that the value of the losses is unchanged. Without it, a
+    location is learned more slowly the wider its scale is; with β = 1 all locations are learned as with squared error.
+
+    Args:
+        losses: negative log-likelihood of each number.
+        scale: scale of each number's density; no gradient flows through the factor.
+        balance: β, 0 to 1.
+    """
+    share = scale.detach() ** (2 * balance)
+    return losses.detach() + share * (losses - losses.detach())

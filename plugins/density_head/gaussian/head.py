@@ -12,7 +12,7 @@ from torch.nn.functional import hardtanh, mse_loss
 from framework.density_head import DensityHead
 from framework.errors import ConfigError
 from framework.heads.parameters import require_finite, require_validation
-from framework.heads.scales import scale_of_raw
+from framework.heads.scales import balance_losses, scale_of_raw
 from framework.heads.unit import Unit
 from framework.storage.weights import require_state
 from framework.target import Target
@@ -102,9 +102,7 @@ class GaussianHead(DensityHead):
             mean, scale, coefficients = self._parts(raw)
             value = self.unit.standardise(target).to(mean)
             losses = -Gaussian(mean, scale, coefficients).each_log_prob(value)
-            share = scale.detach() ** (2 * self.balance)
-            # the value of the losses and, in the gradient, share times theirs
-            return (losses.detach() + share * (losses - losses.detach())).sum(-1) + self.unit.log_volume
+            return balance_losses(losses, scale, self.balance).sum(-1) + self.unit.log_volume
         # σ = 1 here also after calibration. There may be very many numbers, so that few passes over them are made.
         target = self.unit.standardise(target).to(raw)
         mean, target = torch.broadcast_tensors(self._mean(require_finite(raw, self.size)), target)

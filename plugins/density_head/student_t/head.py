@@ -11,7 +11,7 @@ from torch.nn.functional import hardtanh
 
 from framework.density_head import DensityHead
 from framework.heads.parameters import require_finite, require_validation
-from framework.heads.scales import scale_of_raw
+from framework.heads.scales import balance_losses, scale_of_raw
 from framework.heads.unit import Unit
 from framework.storage.weights import require_state
 from framework.target import Target
@@ -101,9 +101,7 @@ class StudentTHead(DensityHead):
         else:
             losses = -StudentT(location, scale, freedom).each_log_prob(value)
         if self.balance:
-            share = scale.detach() ** (2 * self.balance)
-            # the value of the losses and, in the gradient, share times theirs
-            losses = losses.detach() + share * (losses - losses.detach())
+            losses = balance_losses(losses, scale, self.balance)
         return losses.sum(-1) + self.unit.log_volume
 
     @torch.no_grad()
