@@ -15,6 +15,13 @@ from torch import Tensor
 from framework.density_head import DensityHead
 from framework.target import Target
 
+CLASSES, ANGLE, REALS = (
+    Target("class", ("a", "b", "c")),
+    Target("angle", ("azimuth",)),
+    Target("real", ("x", "y")),
+)
+"""One small target of each kind, for rows that need no particular target."""
+
 
 @dataclass(frozen=True)
 class Case:

@@ -1,12 +1,11 @@
 """Contract-test cases: classes, real numbers and angles."""
 
-from framework.target import Target
-from framework.testing.rows import MetricRow
+from framework.testing.rows import ANGLE, CLASSES, REALS, MetricRow
 
 ROWS = {
     "mutual_information": (
-        MetricRow("classes", Target("class", ("a", "b", "c"))),
-        MetricRow("reals", Target("real", ("x", "y"))),
-        MetricRow("an angle", Target("angle", ("azimuth",))),
+        MetricRow("classes", CLASSES),
+        MetricRow("reals", REALS),
+        MetricRow("an angle", ANGLE),
     )
 }

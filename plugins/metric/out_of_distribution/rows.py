@@ -1,11 +1,6 @@
 """Contract-test cases: all scores, for classes, real numbers and angles."""
 
-from framework.target import Target
-from framework.testing.rows import MetricRow
-
-CLASSES = Target("class", ("a", "b", "c"))
-REALS = Target("real", ("x", "y"))
-ANGLE = Target("angle", ("azimuth",))
+from framework.testing.rows import ANGLE, CLASSES, REALS, MetricRow
 
 SINGLE = {"perfect beats random": "the densities are those of single models, without mutual information"}
 ROWS = {

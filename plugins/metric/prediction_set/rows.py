@@ -4,7 +4,7 @@ The densities of the contract tests have no prediction sets. test_prediction_set
 """
 
 from framework.target import Target
-from framework.testing.rows import MetricRow
+from framework.testing.rows import ANGLE, CLASSES, MetricRow
 
 NO_SET = "the densities of the contract tests have no prediction sets; the metric's own test runs this check on sets"
 CHECKS = (
@@ -25,8 +25,8 @@ ROWS = {
     "prediction_set": tuple(
         MetricRow(name, target, leave_out=dict.fromkeys(CHECKS, NO_SET))
         for name, target in {
-            "classes": Target("class", ("a", "b", "c")),
-            "one angle": Target("angle", ("azimuth",)),
+            "classes": CLASSES,
+            "one angle": ANGLE,
             "one real": Target("real", ("height",)),
         }.items()
     )

@@ -1,11 +1,9 @@
 """Contract-test cases: adversarial training, for each kind of target."""
 
 from framework.target import Target
-from framework.testing.rows import ObjectiveRow
+from framework.testing.rows import CLASSES, REALS, ObjectiveRow
 
-CLASSES = Target("class", ("a", "b", "c"))
 ANGLES = Target("angle", ("azimuth", "elevation"))
-REALS = Target("real", ("x", "y"))
 JOINT = {"different members train separately": "x' follows the gradient of the joint loss of all members"}
 
 ROWS = {

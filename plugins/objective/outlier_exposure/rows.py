@@ -1,12 +1,9 @@
 """Contract-test cases: outlier exposure, for each kind of target and divergence."""
 
 from framework.target import Target
-from framework.testing.rows import ObjectiveRow
+from framework.testing.rows import ANGLE, CLASSES, REALS, ObjectiveRow
 
-CLASSES = Target("class", ("a", "b", "c"))
-ANGLE = Target("angle", ("azimuth",))
 ANGLES = Target("angle", ("azimuth", "elevation"))
-REALS = Target("real", ("x", "y"))
 BOX = {"low": -4.0, "high": 4.0}  # the range of the thesis's toy data
 
 ROWS = {

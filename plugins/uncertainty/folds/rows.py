@@ -4,17 +4,16 @@ No case has an identity, a setting with which the wrapper equals the model: each
 it, so that there are at least two models.
 """
 
-from framework.target import Target
-from framework.testing.rows import WrapperRow
+from framework.testing.rows import ANGLE, CLASSES, REALS, WrapperRow
 
 SHORT = {"steps": 10, "epochs": 1}
 ROWS = {
     "folds": (
-        WrapperRow("reals", Target("real", ("x", "y")), {"folds": 2, **SHORT}),
-        WrapperRow("classes", Target("class", ("a", "b", "c")), {"folds": 3, **SHORT}),
+        WrapperRow("reals", REALS, {"folds": 2, **SHORT}),
+        WrapperRow("classes", CLASSES, {"folds": 3, **SHORT}),
         WrapperRow(
             "one angle, one group",
-            Target("angle", ("azimuth",)),
+            ANGLE,
             {"folds": 2, "dropout": [0.2], "weight_decay": [0.0], **SHORT},
         ),
     )

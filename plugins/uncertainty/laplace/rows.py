@@ -1,13 +1,7 @@
 """Contract-test cases: each form of the covariance and each choice of the prior, for each kind of target."""
 
-from framework.target import Target
-from framework.testing.rows import WrapperRow
+from framework.testing.rows import ANGLE, CLASSES, REALS, WrapperRow
 
-CLASSES, ANGLE, REALS = (
-    Target("class", ("a", "b", "c")),
-    Target("angle", ("azimuth",)),
-    Target("real", ("x", "y")),
-)
 FIXED = {"prior_precision": 10.0}
 NO_FIT = {
     "calibration does not harm": "the posterior is fitted to the training split, not to the likelihood of the "

@@ -5,13 +5,8 @@ that of one stochastic pass (test_mc_dropout.py).
 """
 
 from framework.target import Target
-from framework.testing.rows import WrapperRow
+from framework.testing.rows import ANGLE, CLASSES, REALS, WrapperRow
 
-CLASSES, ANGLE, REALS = (
-    Target("class", ("a", "b", "c")),
-    Target("angle", ("azimuth",)),
-    Target("real", ("x", "y")),
-)
 ROWS = {
     "ensemble": (
         WrapperRow("classes", CLASSES, identity={"members": 1}),

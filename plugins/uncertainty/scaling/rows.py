@@ -1,14 +1,14 @@
 """Contract-test cases: temperatures for every kind of target, and Platt scaling for two and for several classes."""
 
 from framework.target import Target
-from framework.testing.rows import WrapperRow
+from framework.testing.rows import ANGLE, CLASSES, REALS, WrapperRow
 
-TWO, THREE, FIVE = (Target("class", names) for names in (("off", "on"), tuple("abc"), tuple("abcde")))
+TWO, FIVE = Target("class", ("off", "on")), Target("class", tuple("abcde"))
 ROWS = {
     "temperature": (
-        WrapperRow("classes", THREE, identity={}),
-        WrapperRow("one angle", Target("angle", ("azimuth",)), identity={}),
-        WrapperRow("two reals", Target("real", ("x", "y")), identity={}),
+        WrapperRow("classes", CLASSES, identity={}),
+        WrapperRow("one angle", ANGLE, identity={}),
+        WrapperRow("two reals", REALS, identity={}),
         WrapperRow("never sharper", Target("real", ("height",)), {"lower": 1.0}, identity={"upper": 1.0}),
     ),
     "platt": (

@@ -1,13 +1,7 @@
 """Contract-test cases: one for each kind of target. No epoch is collected here; test_swag.py collects some first."""
 
-from framework.target import Target
-from framework.testing.rows import WrapperRow
+from framework.testing.rows import ANGLE, CLASSES, REALS, WrapperRow
 
-CLASSES, ANGLE, REALS = (
-    Target("class", ("a", "b", "c")),
-    Target("angle", ("azimuth",)),
-    Target("real", ("x", "y")),
-)
 ROWS = {
     "swag": (
         WrapperRow("classes", CLASSES, identity={}),
