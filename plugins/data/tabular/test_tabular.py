@@ -3,9 +3,6 @@
 import csv
 import json
 import math
-import os
-import subprocess
-import sys
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -19,6 +16,7 @@ from hypothesis import strategies as st
 from framework.configuration.schema import build, resolve
 from framework.datasets.fields import Fields
 from framework.errors import ConfigError, DataError
+from framework.testing.commands import run_commands
 from framework.testing.data_samples import fields_of
 from plugins.data.tabular.data import Tabular
 from plugins.data.tabular.picture import HEIGHT, bars
@@ -381,14 +379,6 @@ RUNS = {
     "real": ("real", "gaussian", "[log_likelihood]"),
     "degrees": ("angle", "von_mises", "[log_likelihood,angular_deviation]"),
 }
-COMMANDS = """
-import json
-import sys
-from framework.app import main
-for line in json.load(sys.stdin):
-    sys.argv = ["framework", *line, "logger=none", "threads=1"]
-    main()
-"""
 
 
 @pytest.mark.slow
@@ -419,15 +409,7 @@ def test_training_test_and_prediction_run_with_every_kind_of_target(tmp_path: Pa
                 f"hydra.run.dir={tmp_path / kind / 'predicted'}",
             ],
         ]
-    process = subprocess.run(
-        [sys.executable, "-c", COMMANDS],
-        input=json.dumps(lines),
-        cwd=tmp_path,
-        env={**os.environ, "FRAMEWORK_CACHE": str(tmp_path / "cache")},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    process = run_commands(tmp_path, *lines)
     assert process.returncode == 0, process.stdout + process.stderr
     for kind in ("class", "real", "degrees"):
         results = json.loads((tmp_path / kind / "results.json").read_text())

@@ -2,38 +2,15 @@
 
 import json
 import math
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
 import framework
+from framework.testing.commands import run_commands
 
-COMMANDS = """
-import json
-import sys
-from framework.app import main
-for line in json.load(sys.stdin):
-    sys.argv = ["framework", *line, "logger=none", "threads=1"]
-    main()
-"""
 SHORT = ["uncertainty.folds.steps=150", "uncertainty.folds.epochs=1"]
-
-
-def run(folder: Path, *lines: list[str]) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", COMMANDS],
-        input=json.dumps(lines),
-        cwd=folder,
-        env={**os.environ, "FRAMEWORK_CACHE": str(folder / "cache")},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +36,7 @@ def test_a_table_is_learned_with_two_settings(table, task, target):
         f"data.target={target}",
         columns,
     ]
-    done = run(
+    done = run_commands(
         table,
         [*start, *SHORT, f"hydra.run.dir={folder}"],
         [
@@ -101,5 +78,5 @@ def test_a_table_is_learned_with_two_settings(table, task, target):
 @pytest.mark.slow
 def test_settings_without_effect_are_refused(table, setting, message):
     start = ["experiment=tabular/classification", f"data.path={table / 'mine.csv'}", "data.target=label"]
-    done = run(table, [*start, setting, f"hydra.run.dir={table / 'refused'}"])
+    done = run_commands(table, [*start, setting, f"hydra.run.dir={table / 'refused'}"])
     assert done.returncode != 0 and message in done.stderr + done.stdout
