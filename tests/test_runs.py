@@ -602,11 +602,13 @@ def test_a_job_of_a_sweep_gives_the_bits_of_a_run_by_itself(
     swept = framework("-m", *QUIET, *sweep, folder="sweep/0")
     assert swept.code == 0, swept.out
     assert swept.losses() == whole.losses()
-    said = (swept.folder / "console.log").read_text(encoding="utf-8")
-    assert "Traceback" not in said
-    assert re.sub(
-        ".*(run folder|ms / sample|measured on|a single sample|in a notebook|all runs|cite|mode=).*", "", said
+    results = re.compile("^(?:epoch .* loss|ended at|.* ↑|.* ↓).*$", re.MULTILINE)
+    of_job, alone = (
+        [line for line in results.findall(output) if "ms / sample" not in line]
+        for output in ((swept.folder / "console.log").read_text(encoding="utf-8"), whole.out)
     )
+    assert of_job == alone
+    assert len(alone) == 8  # three epochs, the end, and four results
 
 
 @pytest.mark.parametrize("at", [2, 14])
