@@ -77,7 +77,7 @@ def test_the_bytes_depend_on_the_contents_alone(saved: Path, tmp_path: Path) -> 
     assert other.read_bytes() == saved.read_bytes()
 
 
-def test_remove(saved: Path) -> None:
+def test_removing_a_removed_checkpoint_is_no_error(saved: Path) -> None:
     WholeCheckpoints().remove_checkpoint(saved)
     WholeCheckpoints().remove_checkpoint(saved)
     assert not saved.exists()
@@ -272,7 +272,7 @@ def test_another_process_in_the_middle_of_saving_is_left_alone(saved: Path) -> N
     assert len(list(saved.parent.iterdir())) == 3
 
 
-def test_describe_mismatch() -> None:
+def test_a_mismatch_counts_missing_unknown_and_misshaped_weights() -> None:
     wanted = {"a": torch.zeros(2, 3), "b": torch.zeros(()), **{f"c{i}": torch.zeros(1) for i in range(9)}}
     assert describe_mismatch(wanted, dict(wanted)) is None
     assert describe_mismatch({}, {}) is None

@@ -108,7 +108,7 @@ def check(cloud, queries, found, i=0):
 @DTYPES
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("points, queries", [(1, 1), (7, 40), (300, 100), (3000, 150)])
-def test_all_kinds_of_clouds(kind, points, queries, dtype, way):
+def test_all_kinds_of_clouds_agree_with_comparing_all_points(kind, points, queries, dtype, way):
     generator = np.random.default_rng(points)
     cloud = torch.tensor(KINDS[kind](points, generator), dtype=dtype)
     asked = torch.tensor(ball(queries, generator), dtype=dtype)
@@ -120,7 +120,7 @@ def test_all_kinds_of_clouds(kind, points, queries, dtype, way):
 
 @DTYPES
 @pytest.mark.parametrize("kind", ["torus", "ball", "clusters", "far outlier", "lattice"])
-def test_large_clouds(kind, dtype):
+def test_large_clouds_agree_with_scipys_tree(kind, dtype):
     cloud = torch.tensor(KINDS[kind](60_000, np.random.default_rng(1)), dtype=dtype)
     asked = torch.tensor(ball(500), dtype=dtype)
     found = nearest(cloud[None], asked)
@@ -157,7 +157,7 @@ number = st.floats(-1, 1, width=32) | st.sampled_from([0.0, -0.0, 1e-40, 0.5, -0
     scale=st.sampled_from([1.0, 1e8, 1e-8, 2.0**70, 2.0**-60]),
     dtype=st.sampled_from([torch.float32, torch.float64]),
 )
-def test_wild_clouds(cloud, queries, scale, dtype):
+def test_any_cloud_agrees_with_comparing_all_points(cloud, queries, scale, dtype):
     cloud, queries = (torch.tensor(a * np.float32(scale)).to(dtype) for a in (cloud, queries))
     check(cloud, queries, nearest(cloud[None], queries))
 

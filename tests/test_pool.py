@@ -570,7 +570,7 @@ def test_two_jobs_in_one_folder_are_refused(app: App) -> None:
     assert "ConfigError: hydra.sweep.subdir gives two jobs the folder" in output
 
 
-def test_free_number() -> None:
+def test_a_job_gets_the_first_number_that_is_not_taken() -> None:
     taken = {Path("0"), Path("1"), Path("3")}
     assert sweep.free_number(lambda number: Path(str(number)), 0, taken) == 2
     assert sweep.free_number(lambda number: Path(str(number)), 4, taken) == 4

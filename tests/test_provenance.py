@@ -16,7 +16,7 @@ def test_versions_name_what_a_result_rests_on() -> None:
     assert found["python"].startswith("3.")
 
 
-def test_flatten() -> None:
+def test_a_config_is_flattened_to_dotted_keys() -> None:
     config = {
         "seed": 0,
         "head": {"name": "mixture", "parts": [{"n": 1}, {"n": 2}]},

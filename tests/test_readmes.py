@@ -83,7 +83,7 @@ def test_a_command_of_a_readme_composes(
         assert config.assembly.parts["data"]
 
 
-def test_there_are_many() -> None:
+def test_the_pages_have_more_than_70_commands() -> None:
     assert len(ALL) > 70
 
 

@@ -357,7 +357,7 @@ def test_a_power_too_narrow_for_any_grid_gets_a_sentence():
         temper(density, hot(1e-3))
 
 
-def test_empty_batches():
+def test_an_empty_batch_of_densities_is_tempered():
     for density in (Cardioid(torch.zeros(0, 1)), Categorical(logits=torch.zeros(0, 3), validate_args=False)):
         warm = temper(density, hot(2.0))
         assert warm.log_prob(density.sample()).shape == (0,)

@@ -230,7 +230,7 @@ def test_a_run_from_open_to_close(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("end", ["FAILED", "KILLED"])
-def test_other_ends(folder: Path, end: str) -> None:
+def test_a_run_keeps_the_status_with_which_it_first_ended(folder: Path, end: str) -> None:
     tracker = open_tracker(folder)
     log(tracker, [1])
     tracker.close(end)
@@ -307,7 +307,7 @@ def test_long_parameters_beside_damaged_ones_stop_nobody(
     assert "params.json: cannot be read as parameters" in caplog.text
 
 
-def test_many_parameters(folder: Path) -> None:
+def test_more_parameters_than_the_store_takes_at_once_are_all_stored(folder: Path) -> None:
     params = {f"group.key{i}": i for i in range(350)}  # the store takes 100 at once
     tracker = open_tracker(folder)
     tracker.log_params(params)
@@ -467,7 +467,7 @@ def test_no_address_with_a_password_is_shown_or_taken_from_a_command(uri: str) -
 @pytest.mark.parametrize(
     "uri", ["sqlite:////home/me@work/a:b@c/mlflow.db", "http://host:5000/a", "mysql://me@host/db"]
 )
-def test_other_addresses_pass(uri: str) -> None:
+def test_an_address_without_password_passes(uri: str) -> None:
     require_no_password(uri)
     assert without_password(uri) == uri.replace("me@host", "host")
 
@@ -1274,7 +1274,7 @@ def test_a_dead_run_without_a_store(tmp_path: Path) -> None:
         ("databricks", "databricks"),
     ],
 )
-def test_addresses(uri: str, expected: str) -> None:
+def test_absolute_addresses_of_stores_are_unchanged(uri: str, expected: str) -> None:
     assert store_uri(uri) == expected
 
 

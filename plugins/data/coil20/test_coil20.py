@@ -108,14 +108,14 @@ def test_views_are_resized(root):
 
 
 @pytest.mark.parametrize("every, training", [(15, 24), (60, 6)])
-def test_other_steps(root, every, training):
+def test_the_step_of_training_views_sets_the_sizes_of_the_splits(root, every, training):
     coil = data(root, every=every)
     coil.prepare()
     assert [*map(len, coil.splits())] == [20 * training, 20 * training, 20 * (72 - 2 * training)]
 
 
 @pytest.mark.skipif("REAL_DATA_ROOT" not in os.environ, reason="REAL_DATA_ROOT is not set")
-def test_the_real_objects():
+def test_eight_of_the_real_objects_are_look_alikes():
     coil = data(Path(os.environ["REAL_DATA_ROOT"]) / "orientation")
     coil.prepare()
     assert coil.fingerprint()["look_alikes"] == "3 5 6 8 9 11 14 19"

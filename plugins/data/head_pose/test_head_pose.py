@@ -142,7 +142,7 @@ def test_wrong_layouts_say_what_is_missing(published: Published, root: Path, tmp
 
 
 @in_two_folders
-def test_empty_split(published: Published, root: Path) -> None:
+def test_an_empty_split_is_named(published: Published, root: Path) -> None:
     published.publish(root, train=[0], test=[20])
     with pytest.raises(DataError, match=r"The validation split is empty \(2 images in all, 0 unreadable\)"):
         prepare_data(published.archive.name, root)
@@ -171,7 +171,7 @@ def test_empty_split(published: Published, root: Path) -> None:
         ("caviar", "mirror", True),
     ],
 )
-def test_config_out_of_range(name: str, key: str, value: Any) -> None:
+def test_a_config_out_of_range_is_refused(name: str, key: str, value: Any) -> None:
     with pytest.raises(ConfigError, match=rf"data\.{key}"):
         schema.resolve("data", {"name": name, key: value})
 

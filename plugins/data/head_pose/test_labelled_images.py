@@ -56,7 +56,7 @@ def test_published_test_set_is_halved_as_the_authors_code_does() -> None:
     assert halves([]) == ([], [])
 
 
-def test_fields(tmp_path: Path) -> None:
+def test_fields_are_the_images_and_angles_of_the_samples(tmp_path: Path) -> None:
     chosen = write_samples(tmp_path)
     splits = read(chosen)
     assert splits.skipped == 0
@@ -121,7 +121,7 @@ def test_angle_that_is_not_finite_is_never_skipped(tmp_path: Path, angle: float)
 
 
 @pytest.mark.parametrize("split", SPLITS)
-def test_empty_split(tmp_path: Path, split: str) -> None:
+def test_an_empty_split_is_named(tmp_path: Path, split: str) -> None:
     chosen = write_samples(tmp_path)
     chosen[split] = []
     with pytest.raises(

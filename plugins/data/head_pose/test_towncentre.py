@@ -87,7 +87,9 @@ def test_a_label_whose_stem_begins_another_stem_gets_its_own_image(root: Path) -
         ("valid=1\npan=370", (370.0, True)),
     ],
 )
-def test_label_files(tmp_path: Path, text: str, expected: tuple[float, bool]) -> None:
+def test_a_label_file_gives_its_angle_and_validity(
+    tmp_path: Path, text: str, expected: tuple[float, bool]
+) -> None:
     (tmp_path / "label.txt").write_bytes(text.encode())
     assert read_label(tmp_path / "label.txt") == expected
 
@@ -159,7 +161,7 @@ def test_the_message_about_a_wrong_layout_names_the_fault_and_the_remedy(root: P
         prepare_data("towncentre", root / "person3")
 
 
-def test_empty_split(root: Path) -> None:
+def test_an_empty_split_is_refused_with_the_number_of_invalid_images(root: Path) -> None:
     for folder in sorted(root.glob("person*"))[2:]:
         for file in folder.glob("*.txt"):
             file.write_text("pan = 1\nvalid = 0\n", encoding="utf-8")

@@ -39,7 +39,7 @@ def prepare_data(root: Path, **config: Any) -> ImagesWithAngles:
     return prepared("images_with_angles", **{"root": str(root), "image_size": 8, **config})
 
 
-def test_whole_folder(tmp_path: Path) -> None:
+def test_a_folder_gives_images_angles_and_splits(tmp_path: Path) -> None:
     data = prepare_data(write_folder(tmp_path))
     assert data.target.kind == "angle"
     assert data.target.names == ("pan", "tilt")  # the column `note` holds no numbers
@@ -172,9 +172,11 @@ def test_radians_are_noticed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "values", [[0.0] * 40, [*[1.0] * 39, 6.3], [1.0] * 20], ids=["all zero", "one beyond 2π", "few rows"]
 )
-def test_small_degrees_are_not_refused_without_reason(tmp_path: Path, values: list[float]) -> None:
+def test_small_degrees_that_are_not_surely_radians_are_read(tmp_path: Path, values: list[float]) -> None:
     rows = [f"{index:03d}.png,{value},{SPLITS[index % 3]}" for index, value in enumerate(values)]
-    prepare_data(write_folder(tmp_path, "file,pan,split\n" + "\n".join(rows)))
+    data = prepare_data(write_folder(tmp_path, "file,pan,split\n" + "\n".join(rows)))
+    targets = torch.cat([fields_of(data, split)["target"] for split in SPLITS]).flatten()
+    torch.testing.assert_close(targets.sort().values, torch.tensor(values).deg2rad().sort().values)
 
 
 def test_augment_changes_the_sign_of_the_named_angles_only(tmp_path: Path) -> None:
@@ -204,7 +206,7 @@ def test_read_gives_inputs_as_the_splits_hold_them(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("key", "value"), [("angles_in", "gradians"), ("image_size", 2), ("jitter", math.nan), ("rot", "x")]
 )
-def test_config_out_of_range(key: str, value: Any) -> None:
+def test_a_config_out_of_range_is_refused(key: str, value: Any) -> None:
     with pytest.raises(ConfigError, match=rf"data\.{key}"):
         schema.resolve("data", {"name": "images_with_angles", key: value})
 

@@ -75,7 +75,7 @@ def write_and_read(
     return read_annotations(folder, "car", "pascal", "image")
 
 
-def test_one_object(tmp_path: Path) -> None:
+def test_an_annotation_gives_the_image_box_and_angles_of_its_object(tmp_path: Path) -> None:
     (annotation,) = write_and_read(tmp_path, CAR)
     # the bbox counts pixels from 1 and includes both ends: 40 × 40 pixels
     assert annotation.box == (10.0, 20.0, 50.0, 60.0)
@@ -106,7 +106,7 @@ def test_many_objects_of_many_classes_and_flags(tmp_path: Path) -> None:
     assert flags == [(True, False, False), (False, True, False), (False, False, True), (False, False, False)]
 
 
-def test_no_objects(tmp_path: Path) -> None:
+def test_an_annotation_without_objects_gives_none(tmp_path: Path) -> None:
     assert write_and_read(tmp_path, objects=EMPTY) == []
 
 
@@ -228,7 +228,7 @@ def test_damaged_annotations_are_read_or_named(tmp_path: Path, compressed: bool)
     assert refused > 200
 
 
-def test_lists(tmp_path: Path) -> None:
+def test_a_list_gives_its_positive_images_and_names_a_line_that_is_wrong(tmp_path: Path) -> None:
     file = tmp_path / "car_train.txt"
     file.write_text(
         "2008_000001 -1\n2008_000002  1\n\n2008_000003  0\n2008_000002 1\nn01_2\n", encoding="utf-8"
@@ -492,7 +492,7 @@ def test_angle_that_is_not_finite_is_never_skipped(root: Path, name: str, value:
     assert all(f"{name}.mat" in str(caught.value) for name in changed)
 
 
-def test_empty_split(root: Path) -> None:
+def test_an_empty_split_is_named(root: Path) -> None:
     (root / VOC_LISTS / "car_val.txt").write_text("", encoding="utf-8")
     with pytest.raises(
         DataError, match=r"The test split of car is empty: none of the objects .*left out: \d+ "
@@ -516,7 +516,7 @@ def test_empty_split(root: Path) -> None:
         ("mirorr", True),
     ],
 )
-def test_config_out_of_range(key: str, value: Any) -> None:
+def test_a_config_out_of_range_is_refused(key: str, value: Any) -> None:
     with pytest.raises(ConfigError, match=rf"data\.{key}"):
         schema.resolve("data", {"name": "pascal3d", key: value})
 

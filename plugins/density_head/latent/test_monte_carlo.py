@@ -135,7 +135,7 @@ def test_an_estimate_of_given_sums():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_extreme_sums(dtype):
+def test_estimates_from_sums_of_very_different_size_do_not_overflow(dtype):
     inf = math.inf
     sums = torch.tensor([[-1e4, 1e4, -inf, -1e4, -1e30], [-1e4 + 1, 1e4, -inf, 1e4, -inf]], dtype=dtype)
     result = estimate_from_sums(sums, 1)
@@ -355,7 +355,7 @@ def test_a_sampled_mixture_tells_its_error():
         torch.testing.assert_close(estimate(density, many).log_mean, density.log_prob(many))
 
 
-def test_rows_of_values():
+def test_every_value_is_paired_with_its_item_of_the_batch():
     value = torch.arange(24.0).reshape(4, 2, 3, 1)
     values, items, shape = rows_of(value, torch.Size((2, 3)), torch.Size((1,)))
     assert values.flatten().tolist() == list(range(24))

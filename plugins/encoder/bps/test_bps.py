@@ -173,7 +173,7 @@ WILD = st.one_of(
     st.sampled_from(DTYPES),
 )
 @settings(max_examples=150, deadline=None)
-def test_wild_clouds(cloud, scale, offset, strategy, count, normalise, dtype):
+def test_any_cloud_is_encoded_as_by_hand_and_decoded(cloud, scale, offset, strategy, count, normalise, dtype):
     clouds = ((torch.tensor(cloud, dtype=torch.float64) + offset) * scale).to(dtype)[None]
     points = basis(strategy, count, 1.0, 13).to(dtype)
     encoded = encode(clouds, prepare_basis(points), ["distance", "delta"], normalise)

@@ -27,7 +27,7 @@ def over_models(components):
     return equal_mixture(components, like, torch.device("cpu"))
 
 
-def test_classes_agree_with_sums():
+def test_entropies_of_class_mixtures_equal_sums_in_numpy():
     logits = 2 * torch.randn(7, 5, 3, dtype=torch.float64)
     probability = torch.softmax(logits, -1).numpy()
     expected = special.entr(probability).sum(-1).mean(1)
@@ -40,7 +40,7 @@ def test_classes_agree_with_sums():
     assert found["mutual_information_sem"] == pytest.approx(stats.sem(total - expected), rel=1e-8)
 
 
-def test_normal_densities_agree_with_quadrature():
+def test_entropies_of_normal_mixtures_equal_quadrature():
     place, scale = (
         torch.tensor([[[-1.0], [0.5], [3.0]]]).double(),
         torch.tensor([[[0.4], [1.0], [0.7]]]).double(),
@@ -57,7 +57,7 @@ def test_normal_densities_agree_with_quadrature():
     assert found["mutual_information"] == pytest.approx(total - expected, abs=1e-6)
 
 
-def test_what_is_no_mixture_over_models_is_one_model():
+def test_only_models_have_mutual_information_and_not_components_of_a_head():
     logits = torch.randn(4, 3, 5, dtype=torch.float64)
     components = Categorical(logits=logits, validate_args=False)
     head = Mixture(torch.randn(4, 3).double(), components)  # as the density head `mixture` returns it

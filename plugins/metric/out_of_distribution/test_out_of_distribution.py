@@ -90,7 +90,7 @@ def test_auroc_equals_scipys_mann_whitney():
 
 
 @pytest.mark.parametrize("count", range(1, 121))
-def test_95_per_cent_is_counted_in_whole_outliers(count):
+def test_fpr95_detects_at_least_95_per_cent_of_the_outliers(count):
     # test samples equal the outliers, so the false positive rate equals the share of detected outliers
     outliers = [float(number) for number in range(count)]
     actual = rank(outliers, outliers)["fpr95"]
@@ -202,7 +202,7 @@ def test_nan_raises_a_message_with_the_split():
         compute_metric([broken], [], score="confidence")
 
 
-def test_the_metric_requests_outliers():
+def test_the_metric_reads_the_splits_test_and_outliers():
     assert OutOfDistribution.splits == ("test", "outliers")
 
 

@@ -245,7 +245,7 @@ def test_of_two_angles_it_is_the_sum():
 
 
 @pytest.mark.parametrize("mean, deviation, scale", [(0.0, 3.0, 3.0), (1.5, 0.4, 2.0), (-30.0, 5.0, 0.1)])
-def test_of_a_gaussian(mean, deviation, scale):
+def test_the_divergence_of_a_gaussian_is_its_closed_form(mean, deviation, scale):
     """Check KL(N(0, s²) ‖ N(μ, σ²)) = log σ/s + (s² + μ²) / 2σ² - 1/2 for each number."""
     torch.manual_seed(0)
     density = torch.distributions.Independent(

@@ -114,7 +114,7 @@ def test_the_information_of_a_normal_density_of_predicted_variance():
     torch.testing.assert_close(information, wanted.detach(), rtol=0.03, atol=0.02 * wanted.max().item())
 
 
-def test_the_precision_is_the_most_likely_one():
+def test_the_prior_precision_maximises_the_marginal_likelihood():
     values = torch.tensor([0.0, 1e-6, 0.2, 3.0, 500.0], dtype=torch.float64)
     for square in (1e-3, 0.7, 40.0):
         found = math.log(most_likely_precision(values, square))

@@ -21,7 +21,7 @@ def rosenbrock(x):
 
 
 @pytest.mark.parametrize("start", [(-1.2, 1.0), (3.0, -7.0), (0.0, 0.0, 0.0)])
-def test_the_curved_valley(start):
+def test_the_minimum_of_the_rosenbrock_function_is_reached(start):
     minimum = minimise([rosenbrock], *free(*start))
     torch.testing.assert_close(minimum.point, torch.ones(len(start)).double(), rtol=0, atol=1e-6)
     assert not minimum.active.any()

@@ -207,7 +207,7 @@ def test_bad_sets_and_targets_get_a_sentence():
     arrays.arrays(np.int64, 12, elements=st.integers(0, 2)),
     st.booleans(),
 )
-def test_nothing_runs_away(logits, label, smoothing):
+def test_slope_and_biases_stay_within_their_bounds(logits, label, smoothing):
     log_prob = torch.from_numpy(logits).log_softmax(-1)
     slope, biases = fit(log_prob, torch.from_numpy(label), smoothing=smoothing)
     assert 0 <= slope <= STEEPEST

@@ -93,7 +93,7 @@ def test_a_prediction_is_the_mean_over_models_with_the_drawn_weights(vectorises)
     torch.testing.assert_close(log_prob.exp(), torch.stack(parts).mean(0), rtol=1e-4, atol=1e-6)
 
 
-def test_weights_that_do_not_move_give_the_model():
+def test_the_density_is_the_models_if_training_does_not_move_the_weights():
     wrapper = follow(Swag(lambda: model({"name": "mlp", "widths": [8]}), start=0.0), size=0.0).eval()
     inputs, target = torch.randn(7, 4), torch.randn(7, 1)
     with torch.no_grad():
