@@ -77,13 +77,18 @@ def time_interleaved(
     milliseconds_of_rounds: dict[str, list[float]] = {name: [] for name in functions}
     for _ in range(rounds):
         for name, call in functions.items():
-            times: list[float] = []
-            while len(times) < 3 or sum(times) < seconds:
-                start = clock()
-                call()
-                times.append(clock() - start)
-            milliseconds_of_rounds[name].append(1e3 * median(times))
+            milliseconds_of_rounds[name].append(median(times_of_calls(call, seconds, clock)))
     return {name: Rounds(tuple(times)) for name, times in milliseconds_of_rounds.items()}
+
+
+def times_of_calls(call: Callable[[], object], seconds: float, clock: Callable[[], float]) -> list[float]:
+    """Return the milliseconds of repeated calls of a function, at least three, for `seconds` of the clock in all."""
+    times: list[float] = []
+    while len(times) < 3 or sum(times) < seconds:
+        start = clock()
+        call()
+        times.append(clock() - start)
+    return [1e3 * duration for duration in times]
 
 
 def require_idle() -> None:

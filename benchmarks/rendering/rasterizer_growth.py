@@ -18,6 +18,7 @@ from statistics import median
 import numpy as np
 
 from benchmarks.pages import read_rows
+from benchmarks.timing import times_of_calls
 from framework.configuration.schema import build, resolve
 from framework.figures.style import COLOURS, MARKERS, save_figure, titled_figure
 from framework.geometry.camera import look_from
@@ -42,12 +43,7 @@ def ball(faces: int, side: int) -> Scene:
 def milliseconds(call: Callable[[], object]) -> float:
     """Return the median processor time of a call, ms, over half a second of calls but at least three."""
     call()
-    times: list[float] = []
-    while len(times) < 3 or sum(times) < 0.5:
-        start = time.thread_time()
-        call()
-        times.append(time.thread_time() - start)
-    return 1e3 * median(times)
+    return median(times_of_calls(call, 0.5, time.thread_time))
 
 
 def slope(sizes: Sequence[float], times: Sequence[float]) -> float:

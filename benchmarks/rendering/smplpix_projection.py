@@ -17,6 +17,7 @@ from torch import Tensor
 from benchmarks.pages import machine, write_page
 from benchmarks.rendering.rasterizer import DISTANCE, FOCAL, HEIGHT, WIDTH, figure
 from benchmarks.rendering.rasterizer_growth import milliseconds, slope
+from benchmarks.timing import times_of_calls
 from framework.configuration.schema import build, resolve
 from framework.geometry.camera import look_from
 from plugins.encoder.projection.encoder import Projection, gather_images, project, visible_points_in_torch
@@ -69,13 +70,9 @@ def shortest_time(call: Callable[[], object], threads: int) -> float:
     """Return the wall time of the shortest call within half a second, ms."""
     torch.set_num_threads(threads)
     call()
-    times: list[float] = []
-    while len(times) < 3 or sum(times) < 0.5:
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
+    shortest = min(times_of_calls(call, 0.5, time.perf_counter))
     torch.set_num_threads(1)
-    return 1e3 * min(times)
+    return shortest
 
 
 def report() -> str:
