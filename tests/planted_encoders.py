@@ -1,8 +1,6 @@
 """Encoders like those of other authors: correct ones, and ones with a planted fault that `mode=check` must find."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -10,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from framework.encoder import Encoder
-from tests.planted_base import Planted
+from tests.planted_base import ChangedClass
 
 IMAGE, VECTOR = (3, 12, 10), (7,)
 
@@ -127,28 +125,17 @@ RIGHT: dict[str, tuple[type[Encoder], tuple[int, ...]]] = {
 
 
 @dataclass(frozen=True)
-class Fault(Planted):
-    """An encoder with one planted fault.
-
-    Attributes:
-        base: correct encoder.
-        changes: methods and attributes of `base` that are replaced.
-    """
+class Fault(ChangedClass):
+    """An encoder with one planted fault."""
 
     base: type[Encoder] = Dense
-    changes: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def shape(self) -> tuple[int, ...]:
         return VECTOR if issubclass(self.base, Dense | Squares) else IMAGE
 
     def build(self, shape: tuple[int, ...]) -> Encoder:
-        return self.kind(shape)  # pyright: ignore[reportCallIssue]
-
-    @cached_property
-    def kind(self) -> type[Encoder]:
-        """Class of the faulty encoder, always the same one, because encoders of two classes cannot be stacked."""
-        return type(self.base.__name__, (self.base,), dict(self.changes))
+        return self.kind(shape)
 
 
 class HalfSlope(torch.autograd.Function):

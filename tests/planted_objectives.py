@@ -1,7 +1,6 @@
 """Objectives like those of other authors: a correct one, and ones with a planted fault that `mode=check` must find."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -11,7 +10,7 @@ from framework.calibration.module_flags import BATCH_NORM, set_flag
 from framework.data import Batch
 from framework.model import Predictor, independent_penalty
 from framework.objective import Objective
-from framework.target import Target
+from tests.planted_base import PlantedForTarget as Fault
 from tests.planted_heads import CLASSES, PLACE
 
 
@@ -125,23 +124,6 @@ class Neighbours(Confidence):
         found = super().each(predictor, batch)
         weight = torch.linspace(0.5, 1.5, len(found), dtype=found.dtype)
         return found * weight.reshape(-1, *(1,) * (found.dim() - 1))
-
-
-@dataclass(frozen=True)
-class Fault:
-    """An objective with one planted fault.
-
-    Attributes:
-        name: description of the fault.
-        kind: class of the objective.
-        target: target of the predictor.
-        by: name of a check that must find the fault.
-    """
-
-    name: str
-    kind: Callable[..., Objective]
-    target: Target
-    by: str
 
 
 ALL_FAULTS = (

@@ -1,7 +1,7 @@
 """Renderers like those of other authors: correct ones, and ones with a planted fault that `mode=check` must find."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from framework.renderer import Renderer, Scene
 from plugins.renderer.rasterizer.renderer import Rasterizer
-from tests.planted_base import Planted
+from tests.planted_base import ChangedClass
 from tests.stranger.stranger_package.renderer import Hits, RayCaster, rays
 
 
@@ -122,19 +122,13 @@ class Wrapped(Renderer):
 
 
 @dataclass(frozen=True)
-class Fault(Planted):
-    """A renderer with one planted fault.
-
-    Attributes:
-        base: correct renderer.
-        changes: methods and attributes of `base` that are replaced.
-    """
+class Fault(ChangedClass):
+    """A renderer with one planted fault."""
 
     base: type[Renderer] = RayCaster
-    changes: Mapping[str, Any] = field(default_factory=dict)
 
     def build(self) -> Renderer:
-        return type(self.base.__name__, (self.base,), dict(self.changes))()
+        return self.kind()
 
 
 def colored(change: Callable[[Tensor], Tensor]) -> Mapping[str, Any]:

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -15,8 +14,8 @@ from framework.distributions.density import Mixture
 from framework.distributions.protocol import cdf, median
 from framework.distributions.tempering import temper
 from framework.model import Predictor, independent_penalty
-from framework.target import Target
 from framework.uncertainty import SelfTraining, Uncertainty
+from tests.planted_base import PlantedForTarget as Fault
 from tests.planted_heads import CLASSES, HEIGHT, ONE, PLACE, Changed
 
 TEMPERATURES = torch.logspace(-1, 1.3, 24, dtype=torch.float64)
@@ -277,23 +276,6 @@ class TrainsUnseeded(Tempered, SelfTraining):
             for parameter in self.parameters():
                 parameter.add_(0.1 * torch.randn(parameter.shape))
             return self.loss(inputs, target).mean().item()
-
-
-@dataclass(frozen=True)
-class Fault:
-    """A wrapper with one planted fault.
-
-    Attributes:
-        name: description of the fault.
-        kind: function that builds the wrapper.
-        target: target that is predicted.
-        by: name of a check that must find the fault.
-    """
-
-    name: str
-    kind: Callable[[Callable[[], Predictor]], Uncertainty]
-    target: Target
-    by: str
 
 
 def unnormalised(density: Any, value: Tensor) -> Tensor:
