@@ -133,21 +133,6 @@ def test_layers_in_another_order_and_side_by_side():
         same(form, model, torch.randn(count, 10))
 
 
-class Twice(Encoder):
-    """Encoder that returns the output of a layer both before and after a ReLU."""
-
-    bibtex = ""
-
-    def __init__(self, length: int) -> None:
-        super().__init__()
-        self.layer = nn.Linear(length, 6)
-        self.output_shape = (12,)
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        found = self.layer(inputs)
-        return torch.cat([found, found.relu()], 1)
-
-
 class Squared(Encoder):
     """Network with an operation that is not a layer."""
 
@@ -160,6 +145,18 @@ class Squared(Encoder):
 
     def forward(self, inputs: Tensor) -> Tensor:
         return self.layer(inputs).square() if inputs.sum() > 0 else self.layer(inputs)
+
+
+class Twice(Squared):
+    """Encoder that returns the output of a layer both before and after a ReLU."""
+
+    def __init__(self, length: int) -> None:
+        super().__init__(length)
+        self.output_shape = (12,)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        found = self.layer(inputs)
+        return torch.cat([found, found.relu()], 1)
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,21 @@ class Signal:
             os.kill(os.getpid(), self.number)
 
 
-class Dial(Data):
+class Signalled(Data):
+    """Base of data sets that send a signal, and that read no files."""
+
+    signal: Signal
+
+    def read(self, files: Sequence[Path]) -> Fields:
+        raise DataError(f"{self.groups[0]} has no files; predict without mode.files.")
+
+    def augment(self, batch: Batch) -> Batch:
+        """Unchanged; sends itself `signal_number` at training batch `signal_at`, unless the marker file is there."""
+        self.signal.count()
+        return batch
+
+
+class Dial(Signalled):
     """Two numbers, the noisy tip of a needle, from which its angle is to be read (synthetic)."""
 
     bibtex = ""
@@ -91,14 +105,6 @@ class Dial(Data):
 
     def test(self) -> Fields:
         return self._part(0.8, 1)
-
-    def read(self, files: Sequence[Path]) -> Fields:
-        raise DataError("a dial has no files; predict without mode.files.")
-
-    def augment(self, batch: Batch) -> Batch:
-        """Unchanged; sends itself `signal_number` at training batch `signal_at`, unless the marker file is there."""
-        self.signal.count()
-        return batch
 
     def fingerprint(self) -> Mapping[str, str]:
         return {"name": "dial", "samples": str(self.samples)}

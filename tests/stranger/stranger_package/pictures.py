@@ -1,22 +1,20 @@
 """A data set of images whose targets are images: squares of one colour, to be told from a faded picture (synthetic)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from framework.data import Batch, Data, Splits
+from framework.data import Splits
 from framework.datasets.fields import Fields
-from framework.errors import DataError
 from framework.geometry.srgb import linear_from_srgb
 from framework.target import Target
-from stranger_package.data import Signal
+from stranger_package.data import Signal, Signalled
 
 
-class Faded(Data):
+class Faded(Signalled):
     """An input is (3, 16, 12): a square of one colour on white, half faded, with noise; the target is the square."""
 
     bibtex = ""
@@ -63,14 +61,6 @@ class Faded(Data):
             index=torch.arange(count),
             group=torch.zeros(count, dtype=torch.int64),
         )
-
-    def read(self, files: Sequence[Path]) -> Fields:
-        raise DataError("faded squares have no files; predict without mode.files.")
-
-    def augment(self, batch: Batch) -> Batch:
-        """Unchanged; sends itself `signal_number` at training batch `signal_at`, unless the marker file is there."""
-        self.signal.count()
-        return batch
 
     def fingerprint(self) -> Mapping[str, str]:
         return {"name": "faded", "samples": str(self.samples)}
