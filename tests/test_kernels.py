@@ -30,7 +30,7 @@ def test_code_is_kept_anew_where_any_of_its_files_changed(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     ("names", "home"),
-    [(raster.KERNELS, raster), (compiled.PARTS, compiled), (projecting.KERNELS, projecting)],
+    [(raster.KERNELS, raster), (compiled.PARTS, compiled), (("compiled",), projecting)],
 )
 def test_every_file_that_compiles_is_among_the_sources(names: tuple[str, ...], home: object) -> None:
     """Numba notices changes only in the file of a function, and not in functions that this function calls."""

@@ -23,7 +23,6 @@ from benchmarks.commands import carry_out, parse_step
 from benchmarks.pages import machine, write_page
 from benchmarks.timing import ROUNDS, median_and_range
 
-ROOT = Path(__file__).resolve().parents[2]
 RUN = ("experiment=moons/vanilla_128", "debug=fast", "pictures=false", "threads=1")
 FEW, MANY = 4, 16
 """Numbers of jobs of two sweeps; the cost of a job is their difference."""

@@ -35,7 +35,6 @@ from plugins.data.human_scans.animation import on_white, orbit, photograph
 
 SUBJECTS = ("test_0000", "test_0003", "test_0005")
 FRAMES, START, AZIMUTH = 20, 0.5, math.radians(35)
-PAIRS = FRAMES - 1
 SHOWN = 8
 """Index of the frame that the figure shows."""
 LOOPS = 60

@@ -13,8 +13,6 @@ from framework.storage.reading import read_bytes, translate_errors
 from framework.storage.text import decode
 
 SUBJECTS, POSES = 10, 10
-TEST = 200
-"""Largest number of test scans."""
 Challenge = Literal["intra", "inter"]
 CHALLENGES: tuple[Challenge, ...] = ("intra", "inter")
 WANTED = (

@@ -21,10 +21,7 @@ _TABLES = {
 
 
 def log_height(concentration: Tensor) -> Tensor:
-    """Return the log-density at the mean, κ - log(2π I0(κ)), nats, for the concentration κ.
-
-    `functions.log_peak` is the same function with an accurate gradient.
-    """
+    """Return the log-density at the mean, κ - log(2π I0(κ)), nats, for the concentration κ."""
     return torch.log(concentration + 2) / 2 - polynomial("log_peak", 2 / (concentration + 2))
 
 

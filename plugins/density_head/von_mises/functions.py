@@ -46,11 +46,6 @@ def log_prob(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
     return (results or in_blocks(_value, value, mean, concentration))[0]
 
 
-def log_peak(concentration: Tensor) -> Tensor:
-    """Return the log-density at the mean, κ - log(2π I0(κ)), nats."""
-    return _apply(_LogPeak, concentration)
-
-
 def mean_resultant(concentration: Tensor) -> Tensor:
     """Return A(κ) = I1(κ)/I0(κ) = E cos(φ-μ), to full relative precision for small and large κ."""
     return _apply(_Ratio, concentration)
@@ -62,7 +57,7 @@ def mean_deviation(concentration: Tensor) -> Tensor:
 
 
 def entropy(concentration: Tensor) -> Tensor:
-    """Return the entropy κ(1 - A(κ)) - log_peak(κ), nats; its derivative is -κ A'(κ)."""
+    """Return the entropy κ(1 - A(κ)) - log_height(κ), nats; its derivative is -κ A'(κ)."""
     return _apply(_Entropy, concentration)
 
 
@@ -237,19 +232,6 @@ class _OfConcentration(Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
         ctx.save_for_backward(*inputs)
-
-
-class _LogPeak(_OfConcentration):
-    """Autograd function of the log-density at the mean, whose derivative with respect to κ is 1 - A(κ)."""
-
-    @staticmethod
-    def forward(concentration: Tensor) -> Tensor:
-        return log_height(concentration)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Tensor:
-        (concentration,) = ctx.saved_tensors
-        return grad * mean_deviation(concentration)
 
 
 class _OneMinusRatio(_OfConcentration):

@@ -122,15 +122,6 @@ def mass_above(value: Tensor, mean: Tensor, concentration: Tensor, equal: float)
     return low, high
 
 
-def interval(mass: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor]:
-    """Return both ends, radians, of the shortest arc with the probability `mass`.
-
-    The ends are mean - w and mean + w for the half width w; they are not reduced modulo 2π.
-    """
-    width = half_width(mass, concentration)
-    return mean - width, mean + width
-
-
 def _one_side(
     sine: Tensor, cosine: Tensor, concentration: Tensor, within: Tensor, constants: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:

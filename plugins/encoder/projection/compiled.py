@@ -18,8 +18,6 @@ from framework.geometry.lanes import LANES, gather, load, mask, store, where
 from framework.geometry.lanes import splat as spread
 from framework.storage.kernels import compiler, kernel_cache
 
-KERNELS = ("compiled",)
-"""Names of the files with compiled functions that call each other."""
 compiled = compiler(kernel_cache("projection", [Path(__file__), Path(lanes.__file__)]))
 
 

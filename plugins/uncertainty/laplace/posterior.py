@@ -143,26 +143,16 @@ def collect(
     return Eigen(spectrum, tuple(vectors)), count
 
 
-def log_evidence(eigenvalues: Float[Tensor, "weight"], square: float, precision: float) -> float:
-    """Return the terms of the Laplace approximation of the log marginal likelihood that depend on the prior, nats.
+def most_likely_precision(eigenvalues: Float[Tensor, "weight"], square: float) -> float:
+    """Return the precision λ of the prior of highest marginal likelihood.
 
-    They are P/2 log λ - λ/2 |W*|² - 1/2 log det(H + λ I) (MacKay 1992).
+    The terms of its Laplace approximation that depend on λ are, for P weights, P/2 log λ - λ/2 |W*|² - 1/2 log det(H +
+    λ I). Their derivative in log λ is (γ - λ |W*|²) / 2, with the number γ = Σ h/(h + λ) of determined weights (MacKay
+    1992). The derivative decreases in λ, so its only zero is found by bisection. λ is bounded by e^±LARGEST_EXPONENT.
 
     Args:
-        eigenvalues: eigenvalues of H.
+        eigenvalues: eigenvalues h of H.
         square: |W*|², the sum of the squared weights.
-        precision: λ.
-    """
-    ratio = torch.log1p(eigenvalues / precision).sum().item()
-    return -(ratio + precision * square) / 2
-
-
-def most_likely_precision(eigenvalues: Float[Tensor, "weight"], square: float) -> float:
-    """Return the precision λ of the prior of highest marginal likelihood (`log_evidence`).
-
-    Its derivative in log λ is (γ - λ |W*|²) / 2, with the number γ = Σ h/(h + λ) of determined weights (MacKay 1992).
-    The derivative decreases in λ, so its only zero is found by bisection. λ is bounded by
-    e^±LARGEST_EXPONENT.
     """
     low, high = -LARGEST_EXPONENT, LARGEST_EXPONENT
     for _ in range(STEPS):
