@@ -1,10 +1,11 @@
-"""Shared functions of the encoders that represent clouds on a grid over [-1, 1]³: encoding and decoding."""
+"""Base class of the encoders on a grid over [-1, 1]³, and the decoding of cells to points."""
 
-from collections.abc import Callable
+from abc import abstractmethod
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from framework.encoder import Encoder
 from framework.errors import DataError
 from framework.geometry.clouds import (
     Normalisation,
@@ -13,36 +14,53 @@ from framework.geometry.clouds import (
     denormalise_clouds,
     normalise_clouds,
     pad,
+    require_clouds,
     require_normalised,
     sizes,
 )
 
 
-def encode_on_cells(
-    clouds: Float[Tensor, "batch points columns"],
-    normalise: Normalisation,
-    by: str,
-    numbers: Callable[[Tensor, int], Tensor],
-    side: int,
-) -> Float[Tensor, "batch 1 side side side"]:
-    """Return one number per cell of a grid of side³ cells over the normalised clouds, where x changes slowest.
+class CellEncoder(Encoder):
+    """Base class of encoders that return one number per cell of a grid of side³ cells over the normalised clouds.
 
     Args:
-        clouds: (batch, points, columns).
-        normalise: as in `framework.geometry.clouds.normalise_clouds`.
+        input_shape: (points, columns) of the largest cloud.
         by: name of the encoder, for messages.
-        numbers: function of the normalised clouds and of `side` that returns the numbers, (batch, side³).
         side: number of cells along each edge.
+        normalise: as in `framework.geometry.clouds.normalise_clouds`.
 
     Raises:
-        DataError: as `framework.geometry.clouds.sizes`; or `normalise` is "none" and the clouds are clearly not
-            normalised.
+        ConfigError: the input is not a cloud.
     """
-    counts = sizes(clouds)
-    local = normalise_clouds(clouds, normalise, counts).clouds
-    if normalise == "none":
-        require_normalised(local[..., :3], 1.0, counts, by=by)
-    return numbers(local, side).reshape(-1, 1, side, side, side)
+
+    fixed = True
+
+    def __init__(self, input_shape: tuple[int, ...], by: str, side: int, normalise: Normalisation) -> None:
+        super().__init__()
+        self.by = f"encoder {by}"
+        require_clouds(input_shape, by=self.by)
+        self.side = side
+        self.normalise: Normalisation = normalise
+        self.output_shape = (1, side, side, side)
+
+    @abstractmethod
+    def encode(self, clouds: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch cells"]:
+        """Return the numbers of the cells for normalised clouds, in the order in which x changes slowest."""
+
+    def forward(
+        self, inputs: Float[Tensor, "batch points columns"]
+    ) -> Float[Tensor, "batch 1 side side side"]:
+        """Return the numbers of the cells.
+
+        Raises:
+            DataError: as `framework.geometry.clouds.sizes`; or `normalise` is "none" and the clouds are clearly not
+                normalised.
+        """
+        counts = sizes(inputs)
+        local = normalise_clouds(inputs, self.normalise, counts).clouds
+        if self.normalise == "none":
+            require_normalised(local[..., :3], 1.0, counts, by=self.by)
+        return self.encode(local).reshape(-1, *self.output_shape)
 
 
 def chosen_centres(

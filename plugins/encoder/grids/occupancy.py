@@ -6,15 +6,14 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from framework.encoder import Encoder
-from framework.geometry.clouds import Normalisation, NormalisedClouds, require_clouds
-from plugins.encoder.grids.cells import chosen_centres, encode_on_cells
+from framework.geometry.clouds import Normalisation, NormalisedClouds
+from plugins.encoder.grids.cells import CellEncoder, chosen_centres
 
 ROUNDING = 1e-6
 """Distance outside [-1, 1] up to which a point still lies in the outermost cell, because norms may round above 1."""
 
 
-class Occupancy(Encoder):
+class Occupancy(CellEncoder):
     """Occupancy of the cells of a grid over [-1, 1]³ by points of the normalised cloud (thesis §6.4.1, §6.5.1).
 
     Features are (1, side, side, side), where x changes slowest, and are 0 or 1 in the clouds' dtype. They have no
@@ -29,7 +28,6 @@ class Occupancy(Encoder):
         ConfigError: the input is not a cloud.
     """
 
-    fixed = True
     bibtex = "maturana2015voxnet"
 
     def __init__(
@@ -39,15 +37,11 @@ class Occupancy(Encoder):
         side: Annotated[int, Field(gt=0, le=512)] = 32,
         normalise: Normalisation = "unit_ball",
     ) -> None:
-        super().__init__()
-        require_clouds(input_shape, by="encoder occupancy")
-        self.side = side
-        self.normalise: Normalisation = normalise
-        self.output_shape = (1, side, side, side)
+        super().__init__(input_shape, "occupancy", side, normalise)
 
-    def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
+    def encode(self, clouds: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch cells"]:
         """Return the occupancy of the cells."""
-        return encode_on_cells(inputs.detach(), self.normalise, "encoder occupancy", occupancy, self.side)
+        return occupancy(clouds, self.side)
 
 
 def occupancy(clouds: Float[Tensor, "batch points columns"], side: int) -> Float[Tensor, "batch cells"]:

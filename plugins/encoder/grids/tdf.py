@@ -2,19 +2,17 @@
 
 import itertools
 import math
-from functools import partial
 from typing import Annotated
 
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from framework.encoder import Encoder
-from framework.geometry.clouds import Normalisation, NormalisedClouds, require_clouds
-from plugins.encoder.grids.cells import chosen_centres, encode_on_cells
+from framework.geometry.clouds import Normalisation, NormalisedClouds
+from plugins.encoder.grids.cells import CellEncoder, chosen_centres
 
 
-class TDF(Encoder):
+class TDF(CellEncoder):
     """Truncated distances of the cells of a grid over [-1, 1]³ from the normalised cloud (thesis §6.5.1).
 
     Features are (1, side, side, side), where x changes slowest, in the clouds' dtype. They are unsigned distances as a
@@ -30,7 +28,6 @@ class TDF(Encoder):
         ConfigError: the input is not a cloud.
     """
 
-    fixed = True
     bibtex = "curless1996volumetric"
 
     def __init__(
@@ -41,17 +38,12 @@ class TDF(Encoder):
         truncation: Annotated[float, Field(gt=0, le=4)] = 1.0,
         normalise: Normalisation = "unit_ball",
     ) -> None:
-        super().__init__()
-        require_clouds(input_shape, by="encoder tdf")
-        self.side = side
+        super().__init__(input_shape, "tdf", side, normalise)
         self.truncation = truncation
-        self.normalise: Normalisation = normalise
-        self.output_shape = (1, side, side, side)
 
-    def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
+    def encode(self, clouds: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch cells"]:
         """Return the truncated distances of the cells."""
-        numbers = partial(truncated_distance, truncation=self.truncation)
-        return encode_on_cells(inputs, self.normalise, "encoder tdf", numbers, self.side)
+        return truncated_distance(clouds, self.side, self.truncation)
 
 
 def truncated_distance(
