@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from framework.density_head import DensityHead
 from framework.target import Target
 
 
@@ -55,3 +56,20 @@ class Unit(NamedTuple):
         if coefficients is not None:
             coefficients = unit[:, None] * coefficients.double() / unit
         return location + unit * mean.double(), unit * scale.double(), coefficients
+
+
+class HeadOfReals(DensityHead):
+    """Base class of heads that compute in the unit of standard deviations, with scales above a floor.
+
+    Attributes:
+        numbers: number of real numbers in the target.
+        floor: smallest scale, in the unit of the raw parameters.
+        unit: unit of the target, in which raw parameters are relative to the training targets.
+    """
+
+    def __init__(self, target: Target, by: str, floor: float) -> None:
+        super().__init__()
+        target.require("real", by=f"density_head {by}")
+        self.numbers = len(target.names)
+        self.floor = floor
+        self.unit = Unit.of(target)

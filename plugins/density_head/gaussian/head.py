@@ -9,11 +9,10 @@ from pydantic import Field
 from torch import Tensor
 from torch.nn.functional import hardtanh, mse_loss
 
-from framework.density_head import DensityHead
 from framework.errors import ConfigError
 from framework.heads.parameters import require_finite, require_validation
 from framework.heads.scales import balance_losses, scale_of_raw
-from framework.heads.unit import Unit
+from framework.heads.unit import HeadOfReals
 from framework.storage.weights import require_state
 from framework.target import Target
 from plugins.density_head.gaussian.density import Gaussian
@@ -26,7 +25,7 @@ LARGEST_COEFFICIENT = 1e3
 SMALLEST_SCALE = 1e-6
 
 
-class GaussianHead(DensityHead):
+class GaussianHead(HeadOfReals):
     """Gaussian over one or more reals, heteroscedastic or not (thesis eq. 2.7-2.8).
 
     With `scale="predicted"` each input has its own standard deviations, trained by likelihood (eq. 2.8). With "fixed"
@@ -62,10 +61,7 @@ class GaussianHead(DensityHead):
         balance: Annotated[float, Field(ge=0, le=1)] = 0.0,
         floor: Annotated[float, Field(ge=SMALLEST_SCALE, le=1.0)] = 1e-4,
     ) -> None:
-        super().__init__()
-        target.require("real", by="density_head gaussian")
-        self.numbers = len(target.names)
-        self.floor = floor
+        super().__init__(target, "gaussian", floor)
         self.balance = balance
         self.predicted = scale == "predicted"
         if balance and not self.predicted:
@@ -76,7 +72,6 @@ class GaussianHead(DensityHead):
         self.full = covariance == "full" and self.numbers > 1
         pairs = self.numbers * (self.numbers - 1) // 2 if self.full else 0
         self.size = 2 * self.numbers + pairs if self.predicted else self.numbers
-        self.unit = Unit.of(target)
         if not self.predicted:
             self.register_buffer("scale", torch.ones(self.numbers, dtype=torch.float64))
             side = (

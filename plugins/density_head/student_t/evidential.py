@@ -7,10 +7,9 @@ from pydantic import Field
 from torch import Tensor
 from torch.nn.functional import hardtanh
 
-from framework.density_head import DensityHead
 from framework.heads.parameters import require_finite
 from framework.heads.scales import scale_of_raw
-from framework.heads.unit import Unit
+from framework.heads.unit import HeadOfReals
 from framework.target import Target
 from plugins.density_head.student_t.density import NORMAL, StudentT
 from plugins.density_head.student_t.head import LARGEST_LOCATION
@@ -21,7 +20,7 @@ LEAST_EVIDENCE = 1e-6
 """Least ν, the number of virtual observations of the mean."""
 
 
-class EvidentialHead(DensityHead):
+class EvidentialHead(HeadOfReals):
     """Student's t of a normal-inverse-gamma density of mean and variance, for each input (Amini et al. 2020).
 
     For each number, the network predicts γ, ν, α and β of the density N(μ; γ, σ²/ν) Γ⁻¹(σ²; α, β) of the unknown mean μ
@@ -48,12 +47,8 @@ class EvidentialHead(DensityHead):
         evidence_weight: Annotated[float, Field(ge=0, le=1e3)] = 0.01,
         floor: Annotated[float, Field(ge=1e-6, le=1.0)] = 1e-3,
     ) -> None:
-        super().__init__()
-        target.require("real", by="density_head evidential")
-        self.numbers = len(target.names)
+        super().__init__(target, "evidential", floor)
         self.evidence_weight = evidence_weight
-        self.floor = floor
-        self.unit = Unit.of(target)
         self.size = 4 * self.numbers
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> StudentT:

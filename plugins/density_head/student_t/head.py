@@ -9,10 +9,9 @@ from pydantic import Field
 from torch import Tensor
 from torch.nn.functional import hardtanh
 
-from framework.density_head import DensityHead
 from framework.heads.parameters import require_finite, require_validation
 from framework.heads.scales import balance_losses, scale_of_raw
-from framework.heads.unit import Unit
+from framework.heads.unit import HeadOfReals
 from framework.storage.weights import require_state
 from framework.target import Target
 from plugins.density_head.student_t.density import NORMAL, StudentT
@@ -32,7 +31,7 @@ With few samples, the factor stays near 1 and the density near a normal one.
 """
 
 
-class StudentTHead(DensityHead):
+class StudentTHead(HeadOfReals):
     """Student's t over one or more independent reals, with a location and a scale for each input.
 
     Its tails fall with a power, so that a target far from the location costs a few nats where a Gaussian costs
@@ -65,12 +64,8 @@ class StudentTHead(DensityHead):
         balance: Annotated[float, Field(ge=0, le=1)] = 0.5,
         floor: Annotated[float, Field(ge=1e-6, le=1.0)] = 1e-3,
     ) -> None:
-        super().__init__()
-        target.require("real", by="density_head student_t")
-        self.numbers = len(target.names)
+        super().__init__(target, "student_t", floor)
         self.balance = balance
-        self.floor = floor
-        self.unit = Unit.of(target)
         self.calibrated = degrees_of_freedom == "calibrated"
         self.predicted = degrees_of_freedom == "predicted"
         self.size = (3 if self.predicted else 2) * self.numbers
