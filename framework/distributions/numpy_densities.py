@@ -482,7 +482,22 @@ class Categorical(Density):
         return Value(value, np.zeros_like(value))
 
 
-class Normal(Density):
+class Symmetric(Density):
+    """Base class of densities whose mean, mode and median are their `location`, (*batch, *event)."""
+
+    location: Array
+
+    def mode(self) -> Array:
+        return self.location
+
+    def mean(self) -> Array:
+        return self.location
+
+    def median(self) -> Array:
+        return self.location
+
+
+class Normal(Symmetric):
     """Normal densities of several numbers: each is regressed on the ones before it.
 
     The residuals e_i = d_i - Σ_{j<i} φ_ij d_j of the deviation d from the mean are independent N(0, σ_i²).
@@ -518,18 +533,9 @@ class Normal(Density):
             noise = (self._mixing() * noise[..., None, :]).sum(-1)
         return self.location + noise
 
-    def mode(self) -> Array:
-        return self.location
-
-    def mean(self) -> Array:
-        return self.location
-
     def entropy(self) -> Value:
         value = (np.log(self.scale) + (1 + math.log(2 * math.pi)) / 2).sum(-1)
         return Value(value, np.zeros_like(value))
-
-    def median(self) -> Array:
-        return self.location
 
     def interval(self, mass: float) -> Interval:
         reach = NormalDist().inv_cdf((1 + mass) / 2) * self.deviation()

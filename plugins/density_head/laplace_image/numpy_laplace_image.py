@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 
-from framework.distributions.numpy_densities import Array, Density, Interval, Value
+from framework.distributions.numpy_densities import Array, Interval, Symmetric, Value
 
 
-class LaplaceImage(Density):
+class LaplaceImage(Symmetric):
     """Independent Laplace densities of the numbers of an image.
 
     Args:
@@ -24,15 +24,6 @@ class LaplaceImage(Density):
 
     def sample(self, generator: np.random.Generator, count: int) -> Array:
         return self.location + generator.laplace(0.0, 1.0, (count, *self.location.shape)) * self.scale
-
-    def mode(self) -> Array:
-        return self.location
-
-    def mean(self) -> Array:
-        return self.location
-
-    def median(self) -> Array:
-        return self.location
 
     def entropy(self) -> Value:
         value = (1 + math.log(2) + np.log(self.scale)).sum((-3, -2, -1))

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from framework.distributions.numpy_densities import Array, Bound, Density, Value
+from framework.distributions.numpy_densities import Array, Bound, Symmetric, Value
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(128)
 _STEPS = 25
@@ -13,7 +13,7 @@ _WIDEST = 40.0
 """Distance from the location, in scales, beyond which a nearly normal density has no probability."""
 
 
-class StudentT(Density):
+class StudentT(Symmetric):
     """Independent densities of Student's t.
 
     Args:
@@ -48,15 +48,6 @@ class StudentT(Density):
         shape = (count, *self.batch, *self.event)
         shrunk = generator.standard_gamma(np.broadcast_to(self.freedom / 2, shape)) / (self.freedom / 2)
         return self.location + self.scale * generator.standard_normal(shape) / np.sqrt(shrunk)
-
-    def mode(self) -> Array:
-        return self.location
-
-    def mean(self) -> Array:
-        return self.location
-
-    def median(self) -> Array:
-        return self.location
 
     def entropy(self) -> Value:
         half = self.freedom / 2
