@@ -1,17 +1,16 @@
 """The density of an affine transform X = location + scale · Y of real numbers, computed from the density of Y."""
 
 from collections.abc import Collection
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions import protocol
-from framework.distributions.description import one_line
+from framework.distributions.description import PlainDensity
 
 
-class AffineDensity(Distribution):
+class AffineDensity(PlainDensity):
     """Density of X = location + scale · Y, for a vector Y of n numbers; each number has its own location and scale.
 
     Args:
@@ -19,10 +18,6 @@ class AffineDensity(Distribution):
         location: numbers that are added, (*batch, n).
         scale: factors, (*batch, n), above 0.
     """
-
-    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
-    has_rsample = False
-    __repr__ = one_line
 
     def __init__(self, density: Distribution, location: Tensor, scale: Tensor) -> None:
         shape = density.batch_shape + density.event_shape

@@ -1,18 +1,18 @@
 """Densities with a changed batch_shape: `Stacked` makes one batch of several densities, `Reshaped` reshapes a batch."""
 
 from collections.abc import Collection, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions import protocol
-from framework.distributions.description import one_line
+from framework.distributions.description import PlainDensity
 from framework.distributions.shapes import broadcast_shapes, unravel_index
 
 
-class Stacked(Distribution):
+class Stacked(PlainDensity):
     """One density with batch_shape (*batch, K), made of K densities with batch_shape (*batch,).
 
     A `Mixture` reads its components in this form.
@@ -20,10 +20,6 @@ class Stacked(Distribution):
     Args:
         densities: the K densities, at least one; all have the same batch_shape, event_shape and support.
     """
-
-    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
-    has_rsample = False
-    __repr__ = one_line
 
     def __init__(self, densities: Sequence[Distribution]) -> None:
         first = densities[0]
@@ -84,17 +80,13 @@ class Stacked(Distribution):
         return torch.stack([density.entropy() for density in self.densities], -1)
 
 
-class Reshaped(Distribution):
+class Reshaped(PlainDensity):
     """A density whose batch_shape is replaced by another one with as many items; the order of the items stays.
 
     Args:
         density: the wrapped density, with any batch_shape.
         batch_shape: the new batch_shape.
     """
-
-    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
-    has_rsample = False
-    __repr__ = one_line
 
     def __init__(self, density: Distribution, batch_shape: torch.Size | tuple[int, ...]) -> None:
         shape = torch.Size(batch_shape)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -11,7 +10,7 @@ from torch.distributions import Distribution, constraints
 from framework.distributions import protocol
 from framework.distributions.batch_shapes import Reshaped
 from framework.distributions.circular import Circular, circular, grid
-from framework.distributions.description import one_line
+from framework.distributions.description import PlainDensity
 from framework.distributions.highest import crossings, highest
 from framework.distributions.many_components import FEWEST, likeliest_modes
 from framework.distributions.medians import median_of_real
@@ -42,7 +41,7 @@ CROSSED = 16
 """Largest number of components with which the search for the mode also starts between every pair (`crossings`)."""
 
 
-class Mixture(Distribution):
+class Mixture(PlainDensity):
     """The density Σ_k w_k p_k with weights w_k and components p_k, which every ensemble and mixture head returns.
 
     The densities are averaged, never their parameters. A mixture of one component equals this component to the last
@@ -58,9 +57,6 @@ class Mixture(Distribution):
     """
 
     over_models = False
-    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
-    has_rsample = False
-    __repr__ = one_line
 
     def __init__(self, log_weights: Tensor, components: Distribution) -> None:
         if log_weights.shape != components.batch_shape:

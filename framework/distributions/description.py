@@ -1,8 +1,10 @@
-"""A density as one line of text for a notebook: its kind, its shapes and its distribution parameters."""
+"""The base class of densities, and a density as one line of text: its kind, shapes and distribution parameters."""
+
+from typing import ClassVar
 
 import torch
 from torch import Tensor
-from torch.distributions import Categorical, Distribution
+from torch.distributions import Categorical, Distribution, constraints
 
 LONGEST = 200
 """Largest number of characters of the line that describes a density."""
@@ -23,6 +25,14 @@ def one_line(self: Distribution) -> str:
     parts += _parameters(self)
     line = f"{type(self).__name__}({', '.join(parts)})"
     return line if len(line) <= LONGEST else f"{line[: LONGEST - 2]}…)"
+
+
+class PlainDensity(Distribution):
+    """Base class of densities whose parameters torch does not check, and which are printed as one line (`one_line`)."""
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+    has_rsample = False
+    __repr__ = one_line
 
 
 class CategoricalDensity(Categorical):

@@ -1,16 +1,14 @@
 """Draws from mixtures whose components are mixtures; only the components that are drawn are computed."""
 
-from typing import ClassVar
-
 import torch
 from torch import Tensor
-from torch.distributions import Distribution, constraints
+from torch.distributions import Distribution
 
-from framework.distributions.description import one_line
+from framework.distributions.description import PlainDensity
 from framework.distributions.protocol import pick, take
 
 
-class PickedMixture(Distribution):
+class PickedMixture(PlainDensity):
     """Density of one of K mixtures, chosen for each item of a batch; only `sample` is defined.
 
     Args:
@@ -19,9 +17,6 @@ class PickedMixture(Distribution):
         index: index of the chosen mixture among K, (*sample, *batch).
         rows: number of draws (of the whole batch) that are computed at once.
     """
-
-    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
-    __repr__ = one_line
 
     def __init__(self, log_weights: Tensor, components: Distribution, index: Tensor, rows: int) -> None:
         self.log_weights = log_weights

@@ -1,22 +1,19 @@
 """Base class of densities that are symmetric about one point and decrease on all sides of it."""
 
 from torch import Tensor
-from torch.distributions import Distribution, constraints
+from torch.distributions import constraints
 
-from framework.distributions.description import one_line
+from framework.distributions.description import PlainDensity
 from framework.distributions.protocol import median
 
 
-class Symmetric(Distribution):
+class Symmetric(PlainDensity):
     """Base class of densities whose mean, mode and median are their `location`.
 
     Args:
         location: (*batch, *event).
         event_dimensions: number of dimensions of an event.
     """
-
-    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
-    __repr__ = one_line
 
     location: Tensor
 

@@ -4,7 +4,6 @@ import logging
 import math
 from collections.abc import Collection
 from functools import cached_property
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -13,7 +12,7 @@ from torch.distributions import Distribution, constraints
 
 from framework.distributions.circular import Circular, grid, wrap
 from framework.distributions.density import Mixture
-from framework.distributions.description import CategoricalDensity, one_line
+from framework.distributions.description import CategoricalDensity, PlainDensity
 from framework.distributions.protocol import (
     Estimate,
     QuadraticBound,
@@ -173,7 +172,7 @@ def _(density: RescaledClasses, value: Tensor) -> Estimate:
     return estimate_with_error(log_prob, *fields)
 
 
-class CircularPower(Distribution):
+class CircularPower(PlainDensity):
     """The density p^(1/T) / Z for a density p of one angle; Z is computed by the trapezium rule on a grid.
 
     The grid starts at the mode, so that no peak is missed there. It is refined until it resolves the power and until p
@@ -193,10 +192,6 @@ class CircularPower(Distribution):
     Raises:
         UserError: the power is too narrow for the finest grid.
     """
-
-    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
-    has_rsample = False
-    __repr__ = one_line
 
     def __init__(self, density: Distribution, temperature: Tensor) -> None:
         self.density = density

@@ -11,7 +11,7 @@ from framework.distributions import protocol
 from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.distributions.circular import Circular, circular
 from framework.distributions.density import Mixture
-from framework.distributions.description import one_line
+from framework.distributions.description import PlainDensity
 from framework.distributions.shapes import broadcast_shapes
 from framework.errors import UserError
 
@@ -44,7 +44,7 @@ def uniform(density: Distribution) -> Distribution:
     )
 
 
-class UniformAngles(Distribution):
+class UniformAngles(PlainDensity):
     """Independent angles, each uniform over the whole circle.
 
     Args:
@@ -52,9 +52,6 @@ class UniformAngles(Distribution):
         batch_shape: batch_shape of the distribution.
         event_shape: event_shape of the distribution, (number of angles,).
     """
-
-    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
-    __repr__ = one_line
 
     def __init__(self, like: Tensor, batch_shape: torch.Size, event_shape: torch.Size) -> None:
         self.like = like

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 from torch.nn.functional import logsigmoid
 
-from framework.distributions.description import one_line
+from framework.distributions.description import PlainDensity
 from framework.distributions.exported import Exported, exported
 from framework.distributions.protocol import (
     estimate,
@@ -23,7 +23,7 @@ from framework.distributions.protocol import (
 from framework.geometry.srgb import linear_from_srgb
 
 
-class BernoulliImage(Distribution):
+class BernoulliImage(PlainDensity):
     """Independent Bernoulli densities of the numbers of an image: each is 1 with its own probability, and 0 otherwise.
 
     A number is the value of one channel of one pixel. For the value y and the log-odds r of a number, log p = y log
@@ -33,9 +33,6 @@ class BernoulliImage(Distribution):
     Args:
         logits: r, (*batch, height, width, number), log-odds of 1.
     """
-
-    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
-    __repr__ = one_line
 
     def __init__(self, logits: Float[Tensor, "*batch height width number"]) -> None:
         self.logits = logits

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from framework.distributions.description import one_line
+from framework.distributions.description import PlainDensity
 from framework.distributions.exported import Exported, exported
 from framework.distributions.protocol import (
     Estimate,
@@ -134,7 +134,7 @@ def sampled_mixture(latent: Latent, points: NormalPoints, effort: Effort) -> Sam
     return SampledMixture(weights, latent.component(number), effort.replicates)
 
 
-class LatentDensity(Distribution):
+class LatentDensity(PlainDensity):
     """The density p(φ|x) = ∫ p(φ|x,z) p(z|x) dz (eq. 3.12, 3.21).
 
     `log_prob` is the logarithm of the mean of importance weights at random values of z. These values are sampled once,
@@ -143,10 +143,6 @@ class LatentDensity(Distribution):
     estimated error is below the tolerance. `sample` draws a new z for every value. `entropy`, `mode`, `median` and
     `marginal` are computed from `mixture`.
     """
-
-    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
-    has_rsample = False
-    __repr__ = one_line
 
     def __init__(self, latent: Latent, effort: Effort) -> None:
         self.latent = latent

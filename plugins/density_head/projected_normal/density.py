@@ -6,10 +6,10 @@ from functools import cached_property
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.distributions import Distribution, constraints
+from torch.distributions import constraints
 
 from framework.distributions.circular import circular, grid, wrap
-from framework.distributions.description import one_line
+from framework.distributions.description import PlainDensity
 from framework.distributions.panels import entropy_of_one
 from framework.distributions.protocol import estimate, exact_estimate, marginal, mode_candidates, pick, take
 from framework.heads.peak_quadrature import refine
@@ -19,7 +19,7 @@ POINTS = 180
 """Number of angles of the grid on which the search for the mode begins."""
 
 
-class ProjectedNormal(Distribution):
+class ProjectedNormal(PlainDensity):
     """Directions of independent normal vectors N(μ, P⁻¹) in the plane, one for each angle.
 
     The density has one or two peaks and may be skewed. With s = t = 0, P is the unit matrix, and the density is
@@ -30,10 +30,6 @@ class ProjectedNormal(Distribution):
         factor: s and t of P = LLᵀ (`functions`), (*batch, angle, 2).
         dtype: dtype of all results; by default that of `mean`. All computations are in float64.
     """
-
-    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
-    has_rsample = False
-    __repr__ = one_line
 
     def __init__(
         self,

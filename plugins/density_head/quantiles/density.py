@@ -5,13 +5,13 @@ from functools import cached_property
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.distributions import Distribution, constraints
+from torch.distributions import constraints
 
 from framework.distributions import protocol
-from framework.distributions.description import one_line
+from framework.distributions.description import PlainDensity
 
 
-class PiecewiseQuantiles(Distribution):
+class PiecewiseQuantiles(PlainDensity):
     """The density of one real number with a piecewise linear quantile function and Pareto tails.
 
     Between the quantiles q_k and q_(k+1) of the probabilities τ_k and τ_(k+1) the density is uniform with the
@@ -27,9 +27,7 @@ class PiecewiseQuantiles(Distribution):
         tail: ξ in [0, ½).
     """
 
-    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
     has_rsample = True
-    __repr__ = one_line
 
     def __init__(
         self,

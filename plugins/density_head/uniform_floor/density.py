@@ -9,7 +9,7 @@ from torch.distributions import Distribution, constraints
 
 from framework.distributions.circular import Circular
 from framework.distributions.density import estimate_of_sum
-from framework.distributions.description import one_line
+from framework.distributions.description import PlainDensity
 from framework.distributions.exported import Exported, exported
 from framework.distributions.panels import entropy_of_one, has_range
 from framework.distributions.protocol import (
@@ -31,7 +31,7 @@ from framework.distributions.tempering import tempered_classes
 from framework.distributions.uniform import uniform
 
 
-class Floored(Distribution):
+class Floored(PlainDensity):
     """Mixture (1 - γ) p + γ u of a density p and a uniform density u, the floor.
 
     Args:
@@ -39,10 +39,6 @@ class Floored(Distribution):
         weight: γ, the weight of the floor, in (0, 1).
         floor: u; None means the uniform density over the support of p.
     """
-
-    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
-    has_rsample = False
-    __repr__ = one_line
 
     def __init__(self, density: Distribution, weight: float, floor: Distribution | None = None) -> None:
         self.density = density
