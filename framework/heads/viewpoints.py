@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions.circular import Circular, grid
-from framework.distributions.description import one_line
+from framework.distributions.description import PlainDensity
 from framework.distributions.panels import entropy_of_one
 from framework.distributions.protocol import estimate, exact_estimate, marginal, pick
 from framework.distributions.shapes import broadcast_shapes
@@ -34,17 +34,13 @@ def log_volume(elevation: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     return torch.log(torch.cos(elevation).abs()) - math.log(VOLUME)
 
 
-class ViewpointDensity(Distribution):
+class ViewpointDensity(PlainDensity):
     """Base of densities of azimuth, elevation and tilt, per radian of each angle in the chart -π/2 ≤ e ≤ π/2.
 
     Args:
         batch_shape: batch_shape of the distribution.
         dtype: dtype of all results.
     """
-
-    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
-    has_rsample = False
-    __repr__ = one_line
 
     def __init__(self, batch_shape: torch.Size, dtype: torch.dtype) -> None:
         self.dtype = dtype
@@ -87,17 +83,13 @@ class UniformViewpoints(ViewpointDensity):
         return self.like.new_full(self.batch_shape, math.log(VOLUME) + 1 - math.log(2))
 
 
-class UniformElevation(Distribution):
+class UniformElevation(PlainDensity):
     """The elevation of uniform rotations, with the density cos e / 2.
 
     Args:
         like: any tensor with the samples' number type and device.
         batch_shape: batch_shape of the distribution.
     """
-
-    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
-    has_rsample = False
-    __repr__ = one_line
 
     def __init__(self, like: Tensor, batch_shape: torch.Size) -> None:
         self.like = like
@@ -127,7 +119,7 @@ class UniformElevation(Distribution):
         return self.like.new_ones(self.batch_shape)
 
 
-class Angle(Distribution):
+class Angle(PlainDensity):
     """The density of one angle of a matrix Fisher density or of a mixture of them; without gradients.
 
     The integral over a second angle is a Bessel function. The integral over the third angle is computed by quadrature
@@ -141,10 +133,6 @@ class Angle(Distribution):
             of shapes (*batch, component, …) whose component dimension may be 1 if all components share the field.
         log_weights: log-weights of the components, (*batch, component), nats; None for a single density.
     """
-
-    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
-    has_rsample = False
-    __repr__ = one_line
 
     def __init__(
         self, joint: ViewpointDensity, index: int, frame: Frame, log_weights: Tensor | None = None

@@ -6,10 +6,10 @@ from functools import cache
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.distributions import Distribution, constraints
+from torch.distributions import constraints
 
 from framework.distributions.circular import Circular, circular, wrap
-from framework.distributions.description import one_line
+from framework.distributions.description import PlainDensity
 from framework.distributions.protocol import estimate, exact_estimate, marginal, pick, tempered_density
 from framework.distributions.uniform import uniform
 from framework.geometry.rotation_grid import cell_of, centres, mean_log_cosine, points_in
@@ -76,7 +76,7 @@ class CellDensity(ViewpointDensity):
         return entropy.to(self.log_weights.dtype)
 
 
-class AngleDensity(Distribution):
+class AngleDensity(PlainDensity):
     """The density of one angle of a `CellDensity`, constant in BINS arcs.
 
     The probability of an arc is computed from many points of each cell, so that it is an approximation, exact in the
@@ -86,10 +86,6 @@ class AngleDensity(Distribution):
         log_density: log-density in each arc, (*batch, arc), nats.
         half: True for the elevation, whose arcs divide the range ±π/2.
     """
-
-    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
-    has_rsample = False
-    __repr__ = one_line
 
     def __init__(self, log_density: Float[Tensor, "*batch arc"], half: bool) -> None:
         self.log_density, self.half = log_density, half
