@@ -1,10 +1,15 @@
-"""Parts that density heads of rotations share: the check of the target, and the matrix from raw parameters."""
+"""Parts that density heads of rotations share: the check of the target, and heads that read a matrix."""
+
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from framework.density_head import DensityHead
 from framework.errors import ConfigError
+from framework.heads.parameters import require_finite
+from framework.heads.viewpoints import MatrixDensity
 from framework.target import Target
 
 ANGLES = ("azimuth", "elevation", "tilt")
@@ -37,3 +42,30 @@ def grown_matrix(raw: Float[Tensor, "*batch 3 3"], largest: float) -> Float[Tens
     growth = (1 + square / 16) ** 1.5
     # where the bound applies, the norm is at least 1; the clamp avoids the square root at 0, which has no gradient
     return raw * torch.minimum(growth, largest / square.clamp(min=1).sqrt())
+
+
+class MatrixHead(DensityHead):
+    """Base of heads that read the nine elements of a matrix X, row by row, for one density with a matrix as parameter.
+
+    The parameter is a multiple of X that grows faster than X (`grown_matrix`). The uniform density of rotations is
+    X = 0 and needs no special case.
+
+    Raises:
+        ConfigError: the target is not azimuth, elevation and tilt, in this order.
+    """
+
+    by: ClassVar[str]
+    """Name of the head, for messages."""
+    density: ClassVar[type[MatrixDensity]]
+    """Class of the densities."""
+    largest: ClassVar[float]
+    """Largest Frobenius norm of the parameter."""
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        require_rotation(target, self.by)
+        self.size = 9
+
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> MatrixDensity:
+        raw = require_finite(raw, self.size)
+        return self.density(grown_matrix(raw.unflatten(-1, (3, 3)), self.largest), raw.dtype)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -11,10 +12,11 @@ from torch.distributions import Distribution, constraints
 from framework.distributions.circular import Circular, grid
 from framework.distributions.description import PlainDensity
 from framework.distributions.panels import entropy_of_one
-from framework.distributions.protocol import estimate, exact_estimate, marginal, pick
+from framework.distributions.protocol import estimate, exact_estimate, marginal, pick, take
 from framework.distributions.shapes import broadcast_shapes
 from framework.distributions.uniform import UniformAngles, uniform
-from framework.geometry.aligned_rotations import Frame
+from framework.geometry import quaternions
+from framework.geometry.aligned_rotations import Frame, align
 from framework.heads import angle_marginals, peak_quadrature
 
 VOLUME = 8 * math.pi**2
@@ -49,6 +51,32 @@ class ViewpointDensity(PlainDensity):
     @property
     def support(self) -> constraints.Constraint:
         return Circular(CHART)
+
+
+class MatrixDensity(ViewpointDensity):
+    """Base of densities of viewpoints with a 3 × 3 matrix as parameter; its singular vectors give the mode.
+
+    Args:
+        parameter: (*batch, 3, 3); 0 is the uniform density of rotations.
+        dtype: dtype of all results; by default the dtype of the parameter. All computations are in float64.
+    """
+
+    def __init__(self, parameter: Float[Tensor, "*batch 3 3"], dtype: torch.dtype | None = None) -> None:
+        self.parameter = parameter
+        super().__init__(parameter.shape[:-2], dtype or parameter.dtype)
+
+    @cached_property
+    def frame(self) -> Frame:
+        """The proper singular value decomposition of the parameter, U S Vᵀ, without gradient."""
+        return align(self.parameter)
+
+    @property
+    def mode(self) -> Float[Tensor, "*batch 3"]:
+        """Viewpoint of the rotation U Vᵀ, at which log p(R) is highest, (*batch, 3).
+
+        This is the mode of the rotation's density: the factor cos e of the viewpoint's density is not included.
+        """
+        return quaternions.to_viewpoint(self.frame.mode).to(self.dtype)
 
 
 class UniformViewpoints(ViewpointDensity):
@@ -230,6 +258,12 @@ def _(density: UniformViewpoints, index: Tensor) -> UniformViewpoints:
 @pick.register
 def _(density: UniformElevation, index: Tensor) -> UniformElevation:
     return UniformElevation(density.like, index.shape)
+
+
+@pick.register
+def _(density: MatrixDensity, index: Tensor) -> MatrixDensity:
+    chosen = take(density.parameter.flatten(-2), index).unflatten(-1, (3, 3))
+    return type(density)(chosen, density.dtype)
 
 
 def _uniform_angle(index: int, like: Tensor, batch_shape: torch.Size) -> Distribution:

@@ -1,20 +1,18 @@
 """The matrix Fisher density of a viewpoint as a torch distribution."""
 
-from functools import cached_property
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from framework.distributions.exported import Exported, exported
-from framework.distributions.protocol import estimate, exact_estimate, marginal, pick, take, tempered_density
+from framework.distributions.protocol import estimate, exact_estimate, marginal, tempered_density
 from framework.distributions.uniform import uniform
 from framework.geometry import aligned_rotations as functions
 from framework.geometry import quaternions
-from framework.heads.viewpoints import Angle, ViewpointDensity, log_volume
+from framework.heads.viewpoints import Angle, MatrixDensity, log_volume
 
 
-class MatrixFisher(ViewpointDensity):
+class MatrixFisher(MatrixDensity):
     """Azimuth a, elevation e and tilt t of a rotation R with density exp(tr(FᵀR)) / c(F) (Downs 1972).
 
     R is framework.geometry.rotation.viewpoint_rotation(a, e, t). Every rotation has one viewpoint in the chart
@@ -36,27 +34,10 @@ class MatrixFisher(ViewpointDensity):
         dtype: dtype of all results; by default the dtype of the parameter. All computations are in float64.
     """
 
-    def __init__(self, parameter: Float[Tensor, "*batch 3 3"], dtype: torch.dtype | None = None) -> None:
-        self.parameter = parameter
-        super().__init__(parameter.shape[:-2], dtype or parameter.dtype)
-
-    @cached_property
-    def frame(self) -> functions.Frame:
-        """The proper singular value decomposition of F, without gradient."""
-        return functions.align(self.parameter)
-
     @property
     def mean_rotation(self) -> Float[Tensor, "*batch 3 3"]:
         """The mean rotation matrix E R, differentiable in F."""
         return functions.mean_rotation(self.parameter).to(self.dtype)
-
-    @property
-    def mode(self) -> Float[Tensor, "*batch 3"]:
-        """Viewpoint of the rotation U Vᵀ, at which log p(R) is highest, (*batch, 3).
-
-        This is the mode of the rotation's density: the factor cos e of the viewpoint's density is not included.
-        """
-        return quaternions.to_viewpoint(self.frame.mode).to(self.dtype)
 
     def log_prob(self, value: Float[Tensor, "... 3"]) -> Float[Tensor, "..."]:
         exact = value.double()
@@ -96,12 +77,6 @@ def _(density: MatrixFisher) -> Exported:
 def _(density: MatrixFisher) -> MatrixFisher:
     """Return the uniform density of rotations, Haar's measure, which is cos e / 8π² on the chart."""
     return MatrixFisher(torch.zeros_like(density.parameter), density.dtype)
-
-
-@pick.register
-def _(density: MatrixFisher, index: Tensor) -> MatrixFisher:
-    chosen = take(density.parameter.flatten(-2), index).unflatten(-1, (3, 3))
-    return MatrixFisher(chosen, density.dtype)
 
 
 @tempered_density.register

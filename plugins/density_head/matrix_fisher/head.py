@@ -1,19 +1,13 @@
 """The matrix Fisher head, which turns nine raw parameters into one density over viewpoints."""
 
-from jaxtyping import Float
-from torch import Tensor
-
-from framework.density_head import DensityHead
-from framework.heads.parameters import require_finite
-from framework.heads.rotations import grown_matrix, require_rotation
-from framework.target import Target
+from framework.heads.rotations import MatrixHead
 from plugins.density_head.matrix_fisher.density import MatrixFisher
 
 LARGEST_PARAMETER = 1e12
 """Largest Frobenius norm of F, for standard deviations of a microradian, which is the resolution of float32 angles."""
 
 
-class MatrixFisherHead(DensityHead):
+class MatrixFisherHead(MatrixHead):
     """One joint matrix Fisher density of azimuth, elevation and tilt, through the rotation that they describe.
 
     The thesis leaves this joint density to future work (§3.7). The network is as in Mohlin et al. 2020.
@@ -27,12 +21,6 @@ class MatrixFisherHead(DensityHead):
     """
 
     bibtex = "mohlin2020probabilistic"
-
-    def __init__(self, target: Target) -> None:
-        super().__init__()
-        require_rotation(target, by="matrix_fisher")
-        self.size = 9
-
-    def forward(self, raw: Float[Tensor, "*batch size"]) -> MatrixFisher:
-        raw = require_finite(raw, self.size)
-        return MatrixFisher(grown_matrix(raw.unflatten(-1, (3, 3)), LARGEST_PARAMETER), raw.dtype)
+    by = "matrix_fisher"
+    density = MatrixFisher
+    largest = LARGEST_PARAMETER

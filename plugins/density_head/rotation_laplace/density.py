@@ -5,17 +5,17 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Categorical
 
-from framework.distributions.protocol import estimate, exact_estimate, marginal, pick, take
+from framework.distributions.protocol import estimate, exact_estimate, marginal
 from framework.distributions.uniform import uniform
 from framework.geometry import aligned_rotations, quaternions
-from framework.heads.viewpoints import Angle, UniformViewpoints, ViewpointDensity, log_volume
+from framework.heads.viewpoints import Angle, MatrixDensity, UniformViewpoints, log_volume
 from plugins.density_head.rotation_laplace import functions
 
 DRAWS = 2000
 """Number of draws from which the entropy is estimated."""
 
 
-class RotationLaplace(ViewpointDensity):
+class RotationLaplace(MatrixDensity):
     """Azimuth a, elevation e and tilt t of a rotation R with density exp(-d)/d up to a constant, d² = tr(S - AᵀR) + δ².
 
     Near the mode, d is proportional to the angle from it, so that log p falls linearly and not quadratically. log_prob
@@ -27,15 +27,6 @@ class RotationLaplace(ViewpointDensity):
         dtype: dtype of all results; by default the dtype of the parameter. All computations are in float64.
     """
 
-    def __init__(self, parameter: Float[Tensor, "*batch 3 3"], dtype: torch.dtype | None = None) -> None:
-        self.parameter = parameter
-        super().__init__(parameter.shape[:-2], dtype or parameter.dtype)
-
-    @property
-    def mode(self) -> Float[Tensor, "*batch 3"]:
-        """Viewpoint of the rotation U Vᵀ, at which log p(R) is highest; the factor cos e is not included."""
-        return quaternions.to_viewpoint(aligned_rotations.align(self.parameter).mode).to(self.dtype)
-
     def log_prob(self, value: Float[Tensor, "... 3"]) -> Float[Tensor, "..."]:
         exact = value.double()
         square = functions.squared_distance(quaternions.of_viewpoint(exact), self.parameter)
@@ -44,7 +35,7 @@ class RotationLaplace(ViewpointDensity):
 
     @torch.no_grad()
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
-        frame = aligned_rotations.align(self.parameter)
+        frame = self.frame
         scale, log_mass = functions.log_node_weights(frame.falls)
         shape = torch.Size(sample_shape) + self.batch_shape
         if not shape.numel():
@@ -73,15 +64,9 @@ def _(density: RotationLaplace) -> UniformViewpoints:
 @marginal.register
 def _(density: RotationLaplace, index: int) -> Angle:
     """Return the density of one angle of the mixture over s, whose components have the falls sλ (`functions`)."""
-    frame = aligned_rotations.align(density.parameter)
+    frame = density.frame
     scale, log_mass = functions.log_node_weights(frame.falls)
     components = aligned_rotations.Frame(
         frame.left.unsqueeze(-3), frame.right.unsqueeze(-3), frame.falls.unsqueeze(-2) * scale.unsqueeze(-1)
     )
     return Angle(density, index, components, log_mass.log_softmax(-1))
-
-
-@pick.register
-def _(density: RotationLaplace, index: Tensor) -> RotationLaplace:
-    chosen = take(density.parameter.flatten(-2), index).unflatten(-1, (3, 3))
-    return RotationLaplace(chosen, density.dtype)
