@@ -2,8 +2,10 @@
 
 import argparse
 import os
+import resource
 import signal
 import subprocess
+import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import FrameType
@@ -51,6 +53,19 @@ def carry_out(command: Sequence[str]) -> None:
         raise SystemExit(128 + received[0])
     if code:
         raise subprocess.CalledProcessError(code, command)
+
+
+def timed_command(command: Sequence[str]) -> tuple[float, float]:
+    """Run a command (`carry_out`); return its wall time and its processor time with all its processes, seconds."""
+    before, start = children_seconds(), time.perf_counter()
+    carry_out(command)
+    return time.perf_counter() - start, children_seconds() - before
+
+
+def children_seconds() -> float:
+    """Return the processor time of all child processes that have ended, seconds."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
 
 
 def parse_step(description: str | None, steps: Iterable[str], folder_help: str) -> tuple[str, Path]:

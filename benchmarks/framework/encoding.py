@@ -10,13 +10,11 @@ GB) afterwards.
 
 import json
 import random
-import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
@@ -24,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.commands import carry_out, parse_step
+from benchmarks.commands import parse_step, timed_command
 from benchmarks.pages import machine, write_page
 from benchmarks.timing import ROUNDS, median_and_range
 
@@ -94,13 +92,6 @@ def command(folder: Path, into: Path, *words: str, several: bool = True) -> list
     return [*start, *SETTINGS, f"mode.files={folder}", f"mode.into={into}", where, *words]
 
 
-def run(words: Sequence[str]) -> tuple[float, float]:
-    """Run a command; return its wall time and its processor time with all its processes, seconds."""
-    before, start = _processor_seconds(), time.perf_counter()
-    carry_out(words)
-    return time.perf_counter() - start, _processor_seconds() - before
-
-
 def rate_between_parts(into: Path, jobs: int) -> float:
     """Return the clouds per second of all jobs together between the first and the last part of each."""
     times = [path.stat().st_mtime for path in sorted(into.glob("part-*.npy"))]
@@ -110,13 +101,13 @@ def rate_between_parts(into: Path, jobs: int) -> float:
 
 def measure(folder: Path) -> dict[str, Any]:
     """Encode the shards in several rounds, and time the encoder alone before each."""
-    run(command(folder / "shards", folder / "warm"))
+    timed_command(command(folder / "shards", folder / "warm"))
     shutil.rmtree(folder / "warm")
     rounds = []
     for number in range(ROUNDS):
         alone, together = encoder_rates()
         into = folder / f"features-{number}"
-        wall, processor = run(command(folder / "shards", into))
+        wall, processor = timed_command(command(folder / "shards", into))
         rounds.append([alone, together, rate_between_parts(into, CORES), wall, processor])
         if number:
             shutil.rmtree(into)
@@ -128,7 +119,7 @@ def measure(folder: Path) -> dict[str, Any]:
     (small / "encoding.json").write_text(json.dumps(index), encoding="utf-8")
     starts = []
     for number in range(ROUNDS):
-        starts.append(list(run(command(small, folder / f"small-{number}", several=False))))
+        starts.append(list(timed_command(command(small, folder / f"small-{number}", several=False))))
     return {"rounds": rounds, "starts": starts}
 
 
@@ -148,7 +139,7 @@ def kill(folder: Path) -> dict[str, Any]:
         process.wait()
         time.sleep(7)  # the jobs end by themselves
         left.append(len(list(into.glob("part-*.npy"))))
-    run(words)
+    timed_command(words)
     names = {path.name for path in whole.iterdir()}
     same = names == {path.name for path in into.iterdir()} and all(
         (whole / name).read_bytes() == (into / name).read_bytes() for name in names
@@ -165,7 +156,7 @@ def files(folder: Path) -> dict[str, Any]:
             words = command(folder / "ply", into, "data=point_cloud_folder", "mode.part=100", several=False)
             if name == "pack":
                 words = [word for word in words if not word.startswith("encoder")] + ["mode.pack=true"]
-            run(words)
+            timed_command(words)
             times = [path.stat().st_mtime for path in sorted(into.glob("part-*.npy"))]
             seconds.append(100 * (len(times) - 1) / (max(times) - min(times)))
             shutil.rmtree(into)
@@ -250,11 +241,6 @@ def main() -> None:
     else:
         results |= steps[step](folder)
         stored.write_text(json.dumps(results), encoding="utf-8")
-
-
-def _processor_seconds() -> float:
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return usage.ru_utime + usage.ru_stime
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ Each step measures one cost and keeps its numbers in the folder; `jobs` measures
 """
 
 import json
-import resource
 import shutil
 import sqlite3
 import sys
@@ -19,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.commands import carry_out, parse_step
+from benchmarks.commands import parse_step, timed_command
 from benchmarks.pages import machine, write_page
 from benchmarks.timing import ROUNDS, median_and_range
 
@@ -33,9 +32,7 @@ FILES = 100_000
 
 def framework(*words: str) -> tuple[float, float]:
     """Run a command; return its wall time and its processor time with all its processes, seconds."""
-    before, start = _processor_seconds(), time.perf_counter()
-    carry_out([sys.executable, "-m", "framework", *words])
-    return time.perf_counter() - start, _processor_seconds() - before
+    return timed_command([sys.executable, "-m", "framework", *words])
 
 
 def jobs(folder: Path) -> dict[str, Any]:
@@ -257,11 +254,6 @@ def _times(call: Callable[[], object]) -> list[float]:
         call()
         times.append(time.perf_counter() - start)
     return times
-
-
-def _processor_seconds() -> float:
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return usage.ru_utime + usage.ru_stime
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ beside this file.
 
 import json
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -17,6 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from benchmarks.commands import children_seconds
 from benchmarks.pages import machine, write_page
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -46,17 +46,11 @@ def run_sweep(fork: bool) -> tuple[float, float, list[float]]:
             *settings,
             f"hydra.sweep.dir={folder}",
         ]
-        before, start = processor_seconds(), time.perf_counter()
+        before, start = children_seconds(), time.perf_counter()
         subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL, env={**os.environ})
-        elapsed, spent = time.perf_counter() - start, processor_seconds() - before
+        elapsed, spent = time.perf_counter() - start, children_seconds() - before
         records = [json.loads((Path(folder) / str(job) / "job.json").read_text()) for job in range(JOBS)]
     return elapsed, spent, [record["processor_seconds"] for record in records]
-
-
-def processor_seconds() -> float:
-    """Return the processor time of all child processes that have ended, seconds."""
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return usage.ru_utime + usage.ru_stime
 
 
 def main() -> None:
