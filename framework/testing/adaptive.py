@@ -211,7 +211,7 @@ class _Map:
         return (offset / self.scale).asinh().clamp(*self.ends)
 
 
-def _rule(points: int, numbers: int) -> tuple[Tensor, Tensor]:
+def rule(points: int, numbers: int) -> tuple[Tensor, Tensor]:
     """Return nodes (points^numbers, numbers) and weights of the Gauss-Legendre rule in the unit box."""
     node, weight = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(points))
     nodes = torch.cartesian_prod(*[(node + 1) / 2] * numbers).reshape(-1, numbers)
@@ -254,17 +254,17 @@ def boxes(density: Distribution) -> Boxes:
             break
         split = min(split, MOST[numbers])
         order = parts[3].argsort(0, descending=True)
-        low, high, split_axis = (_gather_boxes(parts[index], order[:split]) for index in (0, 1, 4))
+        low, high, split_axis = (gather_boxes(parts[index], order[:split]) for index in (0, 1, 4))
         middle = torch.where(split_axis, (low + high) / 2, math.nan)
         halves = torch.cat([low, middle.fmax(low)]), torch.cat([middle.fmin(high), high])
         fresh = _evaluate_boxes(mapping, *halves, candidate_coordinates, candidate_log_prob, peak_coordinates)
         parts = tuple(
-            torch.cat([_gather_boxes(old, order[split:]), new]) for old, new in zip(parts, fresh, strict=True)
+            torch.cat([gather_boxes(old, order[split:]), new]) for old, new in zip(parts, fresh, strict=True)
         )
     return _make_boxes(mapping, *parts[:3])
 
 
-def _gather_boxes(part: Tensor, index: Tensor) -> Tensor:
+def gather_boxes(part: Tensor, index: Tensor) -> Tensor:
     """Return the boxes with the indices `index` from a tensor of boxes.
 
     Args:
@@ -285,7 +285,7 @@ def _nodes(mapping: _Map, low: Tensor, high: Tensor, points: int) -> tuple[Tenso
         high: Upper corners of the boxes, in coordinates.
         points: Gauss-Legendre points per side.
     """
-    nodes, weights = _rule(points, low.shape[-1])
+    nodes, weights = rule(points, low.shape[-1])
     coordinates = low.unsqueeze(1) + (high - low).unsqueeze(1) * nodes[:, None]
     value, volume = mapping.values_and_volumes(coordinates.flatten(0, 1))
     shape = (low.shape[0], len(nodes), low.shape[1])
@@ -323,10 +323,10 @@ def _evaluate_boxes(
         share = weight * log_prob.exp()
         sums.append(share.sum(1))
         # mass of the box if the integrand were everywhere as high as at this node
-        even = share / _rule(points, numbers)[1][:, None]
+        even = share / rule(points, numbers)[1][:, None]
         highest = torch.maximum(highest, even.nan_to_num().amax(1))
         if points == RULES[numbers][0]:
-            rough = _roughness(even.nan_to_num(), points, numbers)
+            rough = roughness(even.nan_to_num(), points, numbers)
             unlike = _unlike_peaks(mapping, low, high, even.nan_to_num(), points, peak_coordinates)
     size = (high - low).prod(-1)
     point = candidate_coordinates.unsqueeze(1)
@@ -348,7 +348,7 @@ def _evaluate_boxes(
     return low, high, sums[0], torch.where(wide & urgency.isfinite(), urgency, 0.0), split_axis
 
 
-def _roughness(integrand: Tensor, points: int, numbers: int) -> Tensor:
+def roughness(integrand: Tensor, points: int, numbers: int) -> Tensor:
     """Return a measure of how rough the integrand is along each axis of each box, (box, rows, axis); 0 for one axis.
 
     The measure is the size of the integrand's part in the two highest Legendre polynomials along the axis. A box is
@@ -357,19 +357,15 @@ def _roughness(integrand: Tensor, points: int, numbers: int) -> Tensor:
     Args:
         integrand: Integrand at the nodes, (box, node, rows).
         points: Nodes per side.
-        numbers: 1 or 2.
+        numbers: Dimension of the density.
     """
     if numbers == 1:
         return torch.zeros_like(integrand[:, :1]).movedim(1, -1)
-    grid = integrand.unflatten(1, (points, points))
+    grid = integrand.unflatten(1, (points,) * numbers)
     highest = _highest_polynomials(points)
-    return torch.stack(
-        [
-            torch.einsum("kn,bnmr->bkmr", highest, grid).abs().sum((1, 2)),
-            torch.einsum("kn,bmnr->bkmr", highest, grid).abs().sum((1, 2)),
-        ],
-        -1,
-    )
+    along = [grid.movedim(1 + number, -1) @ highest.T for number in range(numbers)]
+    # each part is (box, other nodes, rows, coefficient)
+    return torch.stack([part.abs().sum((*range(1, numbers), -1)) for part in along], -1)
 
 
 def _unlike_peaks(

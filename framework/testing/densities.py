@@ -102,8 +102,8 @@ def examine_densities(subject: HeadSubject) -> Iterator[Finding]:
     for name, limit, check, batch in CHECKS:
         if not subject.includes(name) or not applies(name, subject, draws):
             continue
-        # densities of more than two numbers are integrated on a fixed grid, which also counts draws of more than
-        # one number
+        # densities of more than two numbers are integrated over the cells of a fixed grid, in which draws of more than
+        # one number are counted
         grid = {"integral": 2, "samples follow log_prob": 1}.get(name, math.inf)
         too_slow = subject.seconds < TIME_LIMIT  # an earlier check was, most likely at extreme parameters
         chosen = "own" if draws or too_slow or _numbers(subject) > grid else batch
@@ -218,8 +218,8 @@ def applies(name: str, subject: HeadSubject, draws: bool = False) -> bool:
 def integral(density: Distribution, worst: Worst) -> None:
     """Check that the density integrates to 1.
 
-    A density of one or two numbers is integrated by adaptive quadrature, a density of three numbers on a grid, whose
-    place and width are those of draws if the numbers are real.
+    A density of one or two numbers or of three angles is integrated by adaptive quadrature. A density of three real
+    numbers is integrated on a grid, whose place and width are those of draws.
     """
     if density.event_shape in ((1,), (2,)):
         quadrature = boxes(density)

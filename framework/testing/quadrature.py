@@ -1,4 +1,4 @@
-"""Integrals of any density on a fixed grid: the masses of the cells of its domain."""
+"""Integrals of any density over cells of its domain: on a fixed grid, or by adaptive quadrature for three angles."""
 
 import math
 from dataclasses import dataclass
@@ -9,8 +9,9 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.distributions.circular import Circular
+from framework.testing.three_angles import cells_of_three_angles
 
-POINTS = {1: 1020, 2: 504, 3: 60}
+POINTS = {1: 1020, 2: 504}
 """Grid points per side, by the number of angles; the error is negligible for densities that the grid resolves."""
 REAL_POINTS = {1: 1020, 2: 252, 3: 72}
 """Grid points per side, by the number of real numbers."""
@@ -33,10 +34,12 @@ def cells(density: Distribution) -> tuple[list[Tensor], Tensor]:
         classes = density.enumerate_support()
         return [torch.arange(len(classes) + 1) - 0.5], density.log_prob(classes).double().exp()
     numbers = density.event_shape[0]
-    if numbers not in POINTS:
+    if numbers not in CELLS:
         raise ValueError(
-            f"Got a density of {numbers} numbers, but the grid covers one to three. Pass a marginal density."
+            f"Got a density of {numbers} numbers, but the cells cover one to three. Pass a marginal density."
         )
+    if numbers == 3 and isinstance(density.support, Circular):
+        return cells_of_three_angles(density, CELLS[numbers])
     points = (POINTS if isinstance(density.support, Circular) else REAL_POINTS)[numbers]
     count = CELLS[numbers]
     sides = [side(density, index, points, count) for index in range(numbers)]

@@ -65,8 +65,8 @@ class HeadRow(Row):
         cases: Function from the head, in evaluation mode and float64, to reference cases; None where no reference is
             known.
         scale: Standard deviation of random raw parameters. Densities of three numbers, and densities whose log_prob
-            draws random numbers, are integrated on a grid, and only at this scale; it must make them broad enough for
-            the grid. All other densities are also integrated at scales from 1e-2 to 1e3.
+            draws random numbers, are integrated only at this scale; it must make them broad enough for a grid, except
+            if the three numbers are angles. All other densities are also integrated at scales from 1e-2 to 1e3.
     """
 
     target: Target

@@ -50,7 +50,7 @@ ROWS = {
             TARGET,
             COARSE,
             cases=cases,
-            # a midpoint rule with 60 points for each angle; draws check the integral without this error
+            # the adaptive quadrature stops at a number of boxes; draws check the integral without this error
             limits={"integral": 1e-3},
             leave_out={
                 "marginals": JUMPS,
