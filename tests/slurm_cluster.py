@@ -111,6 +111,15 @@ class SlurmCluster:
         for pid in doomed:
             _kill(pid)
 
+    def kill_script(self, number: str) -> None:
+        """Kill the batch script of a running job on its node."""
+        script = f"job{int(number):05}/slurm_script".encode()
+        for process in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):  # the process has ended
+                words = (process / "cmdline").read_bytes().split(b"\0")
+                if any(word.startswith(bytes(self.folder)) and word.endswith(script) for word in words):
+                    _kill(int(process.name))
+
     def command(self, *words: str) -> str:
         """Return the output of a command of SLURM."""
         done = subprocess.run(words, env=self.environment, capture_output=True, text=True, check=False)

@@ -17,6 +17,8 @@ from pathlib import Path
 import pytest
 
 from framework.reports.table import COST_COLUMNS
+from framework.sweeps import slurm as slurm_engine
+from framework.sweeps.node import NODE
 from tests.conftest import PATIENCE, wait_for
 from tests.slurm_cluster import SlurmCluster, missing_programs
 from tests.test_pool import ROOT, App
@@ -51,10 +53,13 @@ def handles(app: App, *numbers: int) -> list[str]:
 
 
 def start_requeued_job(app: App, slurm: SlurmCluster) -> None:
-    """Start job 0 as soon as SLURM has queued it again; SLURM itself waits two minutes."""
+    """Start job 0 three seconds after SLURM has queued it again; SLURM itself waits two minutes.
+
+    A node refuses a job that starts in the same second in which its earlier try was killed.
+    """
     number = app.record(0)["handle"].partition(":")[2]
-    wait_for(lambda: slurm.command("squeue", "-h", "-j", number, "-o", "%T").strip() == "PENDING", 60)
-    slurm.command("scontrol", "update", f"JobId={number}", "StartTime=now")
+    wait_for(lambda: slurm.command("squeue", "-h", "-j", number, "-o", "%T").strip() == "PENDING")
+    slurm.command("scontrol", "update", f"JobId={number}", "StartTime=now+3")
 
 
 def test_a_sweep_begun_on_slurm_is_finished_on_the_pool(app: App) -> None:
@@ -84,7 +89,7 @@ def test_jobs_of_slurm_outlive_their_launcher_and_are_taken_up_again(app: App, s
     again, pool = app.start(*arguments), app.start("-m", "hydra/launcher=pool", *arguments[2:4])
     wait_for(lambda: app.said().count("was started earlier") >= 3)
     (app.folder / "release").touch()
-    assert [again.wait(timeout=60), pool.wait(timeout=60)] == [0, 0], app.said()
+    assert [again.wait(timeout=PATIENCE), pool.wait(timeout=PATIENCE)] == [0, 0], app.said()
     assert handles(app, 0, 1, 2) == before
     assert [app.tries(number) for number in range(3)] == [1, 1, 1]
     assert [app.record(number)["status"] for number in range(3)] == ["completed"] * 3
@@ -111,15 +116,56 @@ def test_a_job_is_neither_lost_nor_doubled_when_its_node_dies(app: App, slurm: S
     assert set(nodes) == {"n1", "n2"}
     before = handles(app, 0, 1)
     slurm.kill_node(nodes[0])
-    wait_for(lambda: "sweep-" in slurm.command("squeue", "-h", "-t", "PENDING", "-o", "%j"), 60)
+    wait_for(lambda: "sweep-" in slurm.command("squeue", "-h", "-t", "PENDING", "-o", "%j"))
     assert app.record(0)["status"] == "running", "SLURM has queued the job again by itself"
     (app.folder / "release").touch()
-    slurm.start_node(nodes[0])
+    # The job starts again on the other node. On its first node, the command that kills its first try could still
+    # arrive; SLURM waits two minutes, so that it arrives before the second try.
     start_requeued_job(app, slurm)
-    assert process.wait(timeout=200) == 0, app.said()
+    assert process.wait(timeout=PATIENCE) == 0, app.said()
+    slurm.start_node(nodes[0])
     assert handles(app, 0, 1) == before
     assert [app.tries(job) for job in range(2)] == [2, 1]
     assert app.record(0)["processor_seconds"] is None
+
+
+@pytest.mark.slow
+def test_a_job_whose_batch_script_is_killed_on_its_node_is_done_again(app: App, slurm: SlurmCluster) -> None:
+    process = app.start("-m", app.chosen, "what=hold")
+    app.until_ready(0)
+    before = app.record(0)["handle"]
+    slurm.kill_script(before.partition(":")[2])
+    wait_for(lambda: app.said().count("#0 started") == 2)
+    assert "#0 died after" in app.said()
+    (app.folder / "release").touch()
+    assert process.wait(timeout=PATIENCE) == 0, app.said()
+    assert (app.tries(0), app.record(0)["status"]) == (2, "completed")
+    assert app.record(0)["handle"] != before
+
+
+@pytest.mark.parametrize(
+    ("line", "lost"),
+    [
+        ("FAILED|JobLaunchFailure", True),
+        ("NODE_FAIL|None", True),
+        ("PREEMPTED|None", True),
+        ("FAILED|NonZeroExitCode", False),
+        ("OUT_OF_MEMORY|OutOfMemory", False),
+        ("CANCELLED|None", False),
+    ],
+)
+@pytest.mark.parametrize("code", [None, 143, 1])
+def test_a_job_is_lost_if_slurm_says_so_and_the_job_did_not_end_by_itself(
+    line: str, lost: bool, code: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = {"handle": "slurm:7", "host": "n1", "seconds": 1.0, "code": code, "reason": None}
+    (tmp_path / NODE).write_text(json.dumps(state))
+    listed = slurm_engine.Listed(*line.split("|"), slurm_engine.job_name(tmp_path))
+    monkeypatch.setattr(slurm_engine.QUEUE, "state", lambda *_, **__: listed)
+    monkeypatch.setattr(slurm_engine, "_ENDED", dict.fromkeys(slurm_engine._ENDED, 0.0))
+    process = slurm_engine.SlurmProcess("slurm:7", tmp_path)
+    assert process.poll() == (-signal.SIGKILL if code is None else code)
+    assert process.lost == (lost and code != 1)
 
 
 @pytest.mark.slow
@@ -130,7 +176,7 @@ def test_a_job_at_its_time_limit_is_queued_again_and_goes_on(app: App, slurm: Sl
     wait_for((app.sweep / "0" / "closed SIGTERM").exists)
     (app.folder / "release").touch()
     start_requeued_job(app, slurm)
-    assert process.wait(timeout=200) == 0, app.said()
+    assert process.wait(timeout=PATIENCE) == 0, app.said()
     assert (app.tries(0), app.record(0)["status"]) == (2, "completed")
     assert app.record(0)["processor_seconds"] > 0
 
@@ -153,7 +199,7 @@ def test_a_closed_terminal_leaves_jobs_of_slurm_alone(app: App) -> None:
     process = app.start("-m", app.chosen, "what=hold")
     app.until_ready(0)
     process.send_signal(signal.SIGHUP)
-    assert process.wait(timeout=60) == 128 + signal.SIGHUP
+    assert process.wait(timeout=PATIENCE) == 128 + signal.SIGHUP
     assert app.record(0)["status"] == "running"
     (app.folder / "release").touch()
     assert app("what=hold")[0] == 0
@@ -195,7 +241,9 @@ def test_a_sweep_begun_on_ray_is_finished_on_the_pool(ray_app: App) -> None:
     before = listening_beyond_loopback()
     process = ray_app.start("-m", ray_app.chosen, "what=ok,raise,once,hold")
     ray_app.until_ready(3)
-    wait_for(lambda: ray_app.record(2)["status"] == "died", PATIENCE)
+    wait_for(
+        lambda: all(ray_app.record(job)["status"] not in ("queued", "running") for job in range(3)), PATIENCE
+    )
     assert listening_beyond_loopback() <= before
     process.kill()
     process.wait()
@@ -263,14 +311,14 @@ def test_a_job_is_done_again_when_the_node_of_its_ray_task_dies(ray_app: App) ->
         )
         ray_app.until_ready(0, 1)
         (ray_app.folder / "kill").touch()
-        wait_for(lambda: "ended by Ray" in ray_app.said(), 60)
+        wait_for(lambda: "ended by Ray" in ray_app.said())
         (ray_app.folder / "release").touch()
-        assert process.wait(timeout=100) == 0, ray_app.said()
+        assert process.wait(timeout=PATIENCE) == 0, ray_app.said()
         assert sorted(ray_app.tries(job) for job in range(2)) == [1, 2]
     finally:
         (ray_app.folder / "kill").touch()
         (ray_app.folder / "end").touch()
-        cluster.wait(timeout=60)
+        cluster.wait(timeout=PATIENCE)
 
 
 @pytest.fixture(scope="module")
@@ -298,7 +346,7 @@ def moons(launcher: str, sweep: Path, environment: Mapping[str, str]) -> list[di
     command = [sys.executable, "-m", "framework", "-m", *MOONS, f"hydra/launcher={launcher}"]
     done = subprocess.run(
         [*command, f"hydra.sweep.dir={sweep}"],
-        cwd=ROOT, env={**os.environ, **environment}, capture_output=True, text=True, timeout=300,
+        cwd=ROOT, env={**os.environ, **environment}, capture_output=True, text=True, timeout=PATIENCE,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     with (sweep / "comparison.csv").open() as file:

@@ -19,7 +19,7 @@ from framework.runs.job import write_value
 from framework.sweeps import engines, sending
 from framework.sweeps import jobs as sweep
 from framework.tracking import ended
-from tests.conftest import imported_by, wait_for
+from tests.conftest import PATIENCE, imported_by, wait_for
 
 LINUX = pytest.mark.skipif(
     sys.platform != "linux", reason="elsewhere a fork is not safe once torch is imported"
@@ -154,6 +154,12 @@ hydra:
 """
 
 
+def handle_signals() -> None:
+    """Handle the signals that this process may ignore: SIGINT as a background job of a shell, SIGHUP under nohup."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 class App:
     """Small application in a folder of its own, with the folder of its sweep."""
 
@@ -187,15 +193,14 @@ class App:
                 env=self.environment,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                # a shell ignores SIGINT in its background jobs, as under nohup
-                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+                preexec_fn=handle_signals,
             )
         self.processes.append(process)
         return process
 
     def __call__(self, *arguments: str) -> tuple[int, str]:
         """Run a sweep, and return its exit code and output."""
-        return self.start("-m", self.chosen, *arguments).wait(timeout=60), self.said()
+        return self.start("-m", self.chosen, *arguments).wait(timeout=PATIENCE), self.said()
 
     def said(self) -> str:
         return self.output.read_text(encoding="utf-8")
@@ -351,7 +356,7 @@ def test_a_signal_lets_the_jobs_close_and_the_sweep_be_resumed(number: signal.Si
     process = app.start("-m", "hydra/launcher=pool", *arguments)
     app.until_ready(0, 1)
     process.send_signal(number)
-    assert process.wait(timeout=60) == 128 + number, app.said()
+    assert process.wait(timeout=PATIENCE) == 128 + number, app.said()
     records = [app.record(job) for job in range(3)]
     assert [record["status"] for record in records] == ["died", "died", "queued"]
     assert [record["error"] for record in records] == [f"stopped by {number.name}"] * 2 + [None]
@@ -369,7 +374,7 @@ def test_ctrl_c_at_the_terminal_reaches_each_job_once(app: App) -> None:
     wait_for(lambda: app.record(0)["pid"] is not None)
     assert os.getsid(app.record(0)["pid"]) == app.record(0)["pid"]
     process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=60) == 130, app.said()
+    assert process.wait(timeout=PATIENCE) == 130, app.said()
 
 
 def test_a_third_signal_kills(app: App) -> None:
@@ -378,7 +383,7 @@ def test_a_third_signal_kills(app: App) -> None:
     for count, number in enumerate((signal.SIGINT, signal.SIGINT, signal.SIGTERM), 1):
         process.send_signal(number)
         wait_for(lambda count=count: app.said().count("asked to stop") == count)
-    assert process.wait(timeout=60) == 130
+    assert process.wait(timeout=PATIENCE) == 130
     assert app.record(0)["error"].startswith("killed by SIGKILL")
 
 
@@ -395,7 +400,7 @@ def test_jobs_of_a_killed_sweep_close_and_the_next_sweep_waits_for_them(app: App
     assert app.record(1)["status"] == "running"
     assert app.tries(1) == 1, "two processes in one folder would mix their checkpoints"
     (app.folder / "release").touch()
-    assert again.wait(timeout=60) == 0, app.said()
+    assert again.wait(timeout=PATIENCE) == 0, app.said()
     assert [app.record(job)["tries"] for job in range(2)] == [2, 2]
 
 
@@ -414,7 +419,7 @@ def test_jobs_end_with_the_process_they_are_forks_of_and_the_next_ones_get_anoth
         wait_for((app.sweep / "0" / "closed SIGTERM").exists)
         wait_for(lambda: app.record(3)["status"] == "completed")
         (app.folder / "release").touch()
-        assert process.wait(timeout=60) == 1
+        assert process.wait(timeout=PATIENCE) == 1
     finally:
         app.close()
     records = [app.record(number) for number in range(4)]
@@ -441,7 +446,7 @@ def test_a_signal_that_comes_before_a_job_has_begun_reaches_it(tmp_path: Path) -
         process.send_signal(signal.SIGTERM)
         wait_for(lambda: "asked to stop" in app.said())
         (app.folder / "signalled").touch()
-        assert process.wait(timeout=60) == 128 + signal.SIGTERM
+        assert process.wait(timeout=PATIENCE) == 128 + signal.SIGTERM
     finally:
         app.close()
     assert [app.record(number)["status"] for number in range(2)] == ["died", "died"]
@@ -514,7 +519,7 @@ def test_a_job_composes_the_config_the_sweep_composed(app: App) -> None:
         f"hydra.sweep.dir='{name.replace(chr(39), chr(92) + chr(39))}'",
         "hydra.sweep.subdir=${hydra.job.override_dirname}/${hydra.job.num}",
     )
-    assert process.wait(timeout=60) == 0, app.said()
+    assert process.wait(timeout=PATIENCE) == 0, app.said()
     seen = sorted((app.folder / name).rglob("seen.json"))
     assert [json.loads(path.read_text()) for path in seen] == [
         ["p", "quoted, text", 0, {"depth": 3}],
@@ -533,7 +538,7 @@ def test_a_job_composes_the_config_the_sweep_composed(app: App) -> None:
 def test_sweeps_that_begin_at_once_in_one_folder_keep_their_jobs_apart(app: App, sweeps: list[str]) -> None:
     app.environment["MEET"] = str(len(sweeps))
     begun = [app.start("-m", "hydra/launcher=pool", one, "hydra.launcher.jobs=2") for one in sweeps]
-    assert [process.wait(timeout=60) for process in begun] == [0] * len(sweeps), app.said()
+    assert [process.wait(timeout=PATIENCE) for process in begun] == [0] * len(sweeps), app.said()
     records = [json.loads(path.read_text()) for path in app.sweep.glob("*/job.json")]
     most: Counter[str] = Counter()
     for one in sweeps:
@@ -557,7 +562,7 @@ def test_a_folder_that_another_job_has_taken_is_left_to_it(app: App) -> None:
     record = app.record(1) | {"key": "another", "overrides": ["y=3"]}
     (app.sweep / "1" / "job.json").write_text(json.dumps(record))
     (app.folder / "release").touch()
-    assert process.wait(timeout=60) == 1
+    assert process.wait(timeout=PATIENCE) == 1
     assert "#1 failed: its folder now belongs to the job 'y=3'" in app.said()
     assert app.record(1) == record
     assert app("what=hold", "x=0,1")[0] == 0

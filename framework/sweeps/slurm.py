@@ -36,7 +36,13 @@ _ENDED = {
 Before that, the file system of the nodes may not show the job's last file yet, or SLURM may queue the job again.
 """
 _UNLISTED = "UNLISTED"
-_LOST = ("NODE_FAIL", "BOOT_FAIL", "PREEMPTED")
+_LOST = ("NODE_FAIL", "BOOT_FAIL", "PREEMPTED", "FAILED (JobLaunchFailure)")
+"""States, some with their reason, of a job that ended through no fault of its own.
+
+SLURM gives the reason JobLaunchFailure to a job that its node could not launch, and to a job whose batch script was
+killed by a signal that SLURM was not asked to send. The script only starts `srun`; a job that is killed for its memory,
+its time or by its user has another state.
+"""
 _INTERVAL, _SHORT_INTERVAL = 5.0, 1.0
 """Seconds between two calls of squeue; the second if the end of a job is expected."""
 
@@ -159,9 +165,10 @@ class SlurmProcess:
         if time.monotonic() - self._ended_at < _ENDED.get(listed.state, 10.0):
             return None
         list(self._folder.iterdir())  # so that a network file system shows the latest files
-        if (state := self._left()) is not None:
+        state = self._left()
+        self.lost = listed.is_lost and (state is None or not 0 <= state["code"] < 128)
+        if state is not None:
             return self._finish(state, listed)
-        self.lost = listed.state in _LOST
         self.reason = f"ended by SLURM: {listed} (job {self._id})"
         self._code = -signal.SIGKILL
         return self._code
@@ -205,6 +212,11 @@ class Listed:
     state: str
     reason: str
     name: str
+
+    @property
+    def is_lost(self) -> bool:
+        """Return whether the job ended through no fault of its own."""
+        return self.state in _LOST or str(self) in _LOST
 
     def __str__(self) -> str:
         return self.state if self.reason in ("", "None") else f"{self.state} ({self.reason})"
