@@ -52,7 +52,7 @@ def imported_by(module: str) -> set[str]:
     return set(done.stdout.split())
 
 
-def wait_for(condition: Callable[[], object], seconds: float = 120) -> None:
+def wait_for(condition: Callable[[], object], seconds: float = PATIENCE) -> None:
     """Wait until the condition holds, and fail after so many seconds."""
     end = time.monotonic() + seconds
     while not condition():

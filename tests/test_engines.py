@@ -5,6 +5,7 @@ are on PATH. Ray runs a cluster of this machine.
 """
 
 import csv
+import ipaddress
 import json
 import os
 import signal
@@ -12,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -23,6 +25,7 @@ from tests.conftest import PATIENCE, wait_for
 from tests.slurm_cluster import SlurmCluster, missing_programs
 from tests.test_pool import ROOT, App
 
+Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 MOONS = (
     *("experiment=moons/vanilla_128", "seed=0,1", "encoder.mlp.widths=[8],[16]", "debug=fast"),
     *("pictures=false", "logger=none", "threads=1"),
@@ -238,13 +241,14 @@ def ray_app(tmp_path: Path) -> Iterator[App]:
 
 @pytest.mark.slow
 def test_a_sweep_begun_on_ray_is_finished_on_the_pool(ray_app: App) -> None:
-    before = listening_beyond_loopback()
     process = ray_app.start("-m", ray_app.chosen, "what=ok,raise,once,hold")
     ray_app.until_ready(3)
     wait_for(
         lambda: all(ray_app.record(job)["status"] not in ("queued", "running") for job in range(3)), PATIENCE
     )
-    assert listening_beyond_loopback() <= before
+    addresses = listening_addresses(process.pid)
+    assert addresses
+    assert all(address.is_loopback for address in addresses), addresses
     process.kill()
     process.wait()
     wait_for((ray_app.sweep / "3" / "closed SIGTERM").exists)
@@ -258,12 +262,47 @@ def test_a_sweep_begun_on_ray_is_finished_on_the_pool(ray_app: App) -> None:
     assert [ray_app.tries(number) for number in range(4)] == [1, 1, 2, 2]
 
 
-def listening_beyond_loopback() -> set[str]:
-    """Return the addresses, other than loopback, at which processes of this machine listen (Linux)."""
-    lines = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+def listening_addresses(parent: int) -> set[Address]:
+    """Return the addresses at which a process and its descendants listen (Linux)."""
+    sockets = set[str]()
+    for pid in family_of(parent):
+        with suppress(OSError):  # the process has ended
+            for file in Path(f"/proc/{pid}/fd").iterdir():
+                with suppress(OSError):
+                    sockets.add(str(file.readlink()))
+    lines = [
+        line.split()
+        for name in ("tcp", "tcp6")
+        for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]
+    ]
     return {
-        address for _, address, _, state, *_ in lines if state == "0A" and not address.startswith("0100007F")
+        address_of(local.partition(":")[0])
+        for _, local, _, state, _, _, _, _, _, inode, *_ in lines
+        if state == "0A" and f"socket:[{inode}]" in sockets
     }
+
+
+def address_of(digits: str) -> Address:
+    """Return an address of /proc/net/tcp or tcp6, whose words of four bytes have the order of the machine."""
+    words = [
+        int(digits[start : start + 8], 16).to_bytes(4, sys.byteorder) for start in range(0, len(digits), 8)
+    ]
+    address = ipaddress.ip_address(b"".join(words))
+    return getattr(address, "ipv4_mapped", None) or address
+
+
+def family_of(parent: int) -> list[int]:
+    """Return a process and its descendants (Linux)."""
+    children: dict[int, list[int]] = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):  # the process has ended
+            children.setdefault(int(stat.read_text().rpartition(")")[2].split()[1]), []).append(
+                int(stat.parent.name)
+            )
+    family = [parent]
+    for pid in family:  # grows while it is read
+        family += children.get(pid, [])
+    return family
 
 
 @pytest.mark.slow
@@ -304,7 +343,7 @@ def test_a_job_is_done_again_when_the_node_of_its_ray_task_dies(ray_app: App) ->
     }
     cluster = subprocess.Popen([sys.executable, "-c", CLUSTER, str(ray_app.folder)], env=ray_app.environment)
     try:
-        wait_for((ray_app.folder / "address").exists, 120)
+        wait_for((ray_app.folder / "address").exists)
         address = (ray_app.folder / "address").read_text()
         process = ray_app.start(
             "-m", ray_app.chosen, "what=hold", "x=0,1", f"hydra.launcher.address='{address}'"
