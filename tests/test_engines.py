@@ -15,12 +15,15 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from framework.errors import ConfigError, UserError
 from framework.reports.table import COST_COLUMNS
 from framework.sweeps import slurm as slurm_engine
 from framework.sweeps.node import NODE
+from framework.sweeps.ray_tasks import Ray, RaySettings
 from tests.conftest import PATIENCE, wait_for
 from tests.slurm_cluster import SlurmCluster, missing_programs
 from tests.test_pool import ROOT, App
@@ -303,6 +306,35 @@ def family_of(parent: int) -> list[int]:
     for pid in family:  # grows while it is read
         family += children.get(pid, [])
     return family
+
+
+@pytest.mark.parametrize("failures", [1, 3])
+def test_a_local_cluster_of_ray_that_does_not_start_is_started_again(
+    failures: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Let `ray.init` fail as on a busy machine."""
+    starts, ended = [], []
+
+    def init(**settings: object) -> None:
+        starts.append(settings)
+        if len(starts) <= failures:
+            raise Exception("The current node timed out during startup.")
+
+    ray = SimpleNamespace(init=init, shutdown=lambda: ended.append(0), remote=lambda **_: lambda task: task)
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.setattr(os, "environ", dict(os.environ))
+    if failures < 3:
+        Ray(RaySettings())
+    else:
+        with pytest.raises(
+            UserError, match=r"no cluster on this machine in 3 attempts \(The current node timed out"
+        ):
+            Ray(RaySettings())
+    assert (len(starts), len(ended)) == (min(failures + 1, 3), failures)
+    with pytest.raises(ConfigError, match=r"address=127\.0\.0\.1:1 cannot be reached"):
+        starts.clear()
+        Ray(RaySettings(address="127.0.0.1:1"))
+    assert len(starts) == 1
 
 
 @pytest.mark.slow

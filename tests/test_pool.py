@@ -219,7 +219,11 @@ class App:
         return len((self.sweep / str(number) / "started").read_text())
 
     def until_ready(self, *numbers: int) -> None:
-        wait_for(lambda: all((self.sweep / str(number) / "ready").exists() for number in numbers))
+        def ready() -> bool:
+            assert not self.processes[-1].poll(), self.said()
+            return all((self.sweep / str(number) / "ready").exists() for number in numbers)
+
+        wait_for(ready)
 
 
 @pytest.fixture(

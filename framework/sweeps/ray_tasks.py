@@ -15,7 +15,7 @@ from uuid import uuid4
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from framework.errors import ConfigError, shorten
+from framework.errors import ConfigError, UserError, shorten
 from framework.sweeps.engines import Process
 from framework.sweeps.node import NodeJob, read_node
 
@@ -23,6 +23,10 @@ _PASSED_ON = ("FRAMEWORK_", "MLFLOW_")
 """Beginnings of the names of environment variables that the jobs receive from this process; Ray passes on none."""
 _OBJECT_STORE = 100_000_000
 """Bytes of shared memory of a local cluster; the tasks exchange no data."""
+_STARTS = 3
+"""Number of attempts to start a local cluster; Ray gives up after 30 s, which a busy machine exceeds."""
+
+_log = logging.getLogger(__name__)
 
 
 class RaySettings(BaseModel):
@@ -44,6 +48,7 @@ class Ray:
 
     Raises:
         ConfigError: The cluster cannot be reached.
+        UserError: Ray starts no cluster on this machine.
     """
 
     interval = 0.1
@@ -74,19 +79,32 @@ class Ray:
             "object_store_memory": _OBJECT_STORE,
             "_node_ip_address": "127.0.0.1",
         }
-        try:
-            ray.init(
-                address=settings.address or "local",
-                log_to_driver=False,
-                logging_level=logging.ERROR,
-                **({} if settings.address else local),
-            )
-        except Exception as error:  # ConnectionError, or an error of gRPC about the token
-            raise ConfigError(
-                f"The Ray cluster hydra.launcher.address={settings.address} cannot be reached "
-                f"({shorten(' '.join(str(error).split()))}). Give the address of its head node (host:port), and its "
-                "token in RAY_AUTH_TOKEN, or null for a cluster on this machine."
-            ) from error
+        for start in range(1, 1 + (_STARTS if settings.address is None else 1)):
+            try:
+                ray.init(
+                    address=settings.address or "local",
+                    log_to_driver=False,
+                    logging_level=logging.ERROR,
+                    **({} if settings.address else local),
+                )
+                break
+            except (
+                Exception
+            ) as error:  # ConnectionError, an error of gRPC about the token, or a start that took 30 s
+                ray.shutdown()
+                reason = shorten(" ".join(str(error).split()))
+                if settings.address is not None:
+                    raise ConfigError(
+                        f"The Ray cluster hydra.launcher.address={settings.address} cannot be reached ({reason}). Give "
+                        "the address of its head node (host:port), and its token in RAY_AUTH_TOKEN, or null for a "
+                        "cluster on this machine."
+                    ) from error
+                if start == _STARTS:
+                    raise UserError(
+                        f"Ray has started no cluster on this machine in {_STARTS} attempts ({reason}). Repeat the "
+                        "command when the machine is less busy, or choose hydra/launcher=pool, which needs no Ray."
+                    ) from error
+                _log.warning("Ray has not started (%s); it is started again", reason)
         self._ray = ray
         self._task = ray.remote(
             num_cpus=settings.cpus,
