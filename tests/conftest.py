@@ -137,6 +137,40 @@ def once(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Once:
     return made
 
 
+RUN_TUTORIAL = """
+import pathlib, sys, time
+sys.path.insert(0, sys.argv[1])
+import notebooks
+start = time.perf_counter()
+notebooks.run(pathlib.Path(sys.argv[2]).read_text("utf-8"), pathlib.Path.cwd())
+pathlib.Path("seconds.txt").write_text(str(time.perf_counter() - start))
+"""
+
+
+@pytest.fixture(scope="session")
+def run_tutorial(once: Once) -> Callable[[str], Path]:
+    """Return a function that runs a tutorial as a notebook, once for all tests, and returns its folder.
+
+    The folder's file seconds.txt holds the run time.
+    """
+    docs = Path(__file__).parent.parent / "docs"
+
+    def run(name: str) -> Path:
+        def make(folder: Path) -> None:
+            page = docs / "tutorials" / f"{name}.md"
+            done = subprocess.run(
+                [sys.executable, "-c", RUN_TUTORIAL, str(docs), str(page)],
+                cwd=folder,
+                capture_output=True,
+                text=True,
+            )
+            assert done.returncode == 0, done.stderr
+
+        return once(f"tutorial_{name}", make)
+
+    return run
+
+
 @pytest.fixture(scope="session")
 def stranger_site(once: Once) -> Path:
     """Return the folder into which pip has installed the third-party package."""

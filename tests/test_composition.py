@@ -142,6 +142,7 @@ SHORTER = {
     "modelnet40/pointnet2": "encoder.pointnet2.width=0.25",
     "modelnet40/bps_conv3d_ensemble": "uncertainty.ensemble.members=2",
     "rasterizer/fit_pose": "density_head.steps=3",
+    "symmetric_solids/implicit_pdf": "density_head.cells=4608",
 }
 """Further settings by the beginning of the experiment's name, without which a run takes up to a minute."""
 

@@ -1,10 +1,14 @@
-"""The path of a newcomer after the installation: the commands of the site, in order, as the pages print them."""
+"""The path of a newcomer after the installation: the commands of the site, in order, as the pages print them.
+
+The last page of the path, the tutorial about an own method, runs as a notebook (`run_tutorial`).
+"""
 
 import os
 import re
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +16,6 @@ import pytest
 from PIL import Image
 
 ROOT = Path(__file__).parent.parent
-INSTALL = "installed"
 
 
 def blocks(page: str, language: str) -> list[str]:
@@ -31,11 +34,6 @@ def printed(page: str, part: str) -> str:
     return matching[0]
 
 
-def cell(page: str, part: str) -> str:
-    """Return the Python block of a page that contains `part`."""
-    return next(block for block in blocks(page, "python") if part in block)
-
-
 def write_images(folder: Path) -> None:
     """Write two classes of images: bright ones with vertical and with horizontal stripes."""
     random = np.random.default_rng(0)
@@ -50,7 +48,7 @@ def write_images(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_the_commands_of_the_site_lead_a_newcomer_to_an_own_method(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, run_tutorial: Callable[[str], Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     random = np.random.default_rng(0)
     table = random.normal(size=(300, 3))
@@ -58,7 +56,6 @@ def test_the_commands_of_the_site_lead_a_newcomer_to_an_own_method(
     np.savetxt(tmp_path / "my.csv", table, delimiter=",", header="a,b,y", comments="")
     write_images(tmp_path / "my_images")
     first_run, own_data = "docs/start/first_run.md", "docs/how_to/own_data.md"
-    tutorial = "docs/tutorials/own_head.md"
     main = printed("README.md", "experiment=pascal3d/scvae").rpartition("&& ")[2]
     steps = {
         "main job": f"{main} debug=fast",  # the site says so for a short run
@@ -66,16 +63,10 @@ def test_the_commands_of_the_site_lead_a_newcomer_to_an_own_method(
         "export": printed("docs/export.md", "mode=export"),
         "own table": printed(own_data, "experiment=tabular/regression"),
         "own images": printed(own_data, "experiment=images/classification data.root=my_images"),
-        "own method": printed(tutorial, "mode=new"),
-        "install it": printed(tutorial, "pip install"),
-        "check": printed(tutorial, "mode=check"),
-        "data of the comparison": f"{sys.executable} - <<'END'\n{cell(tutorial, 'sine.csv')}\nEND",
-        "sweep against ours": printed(tutorial, "density_head=gaussian,my_laplace"),
     }
     environment = {
         **os.environ,
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
-        "PYTHONPATH": str(tmp_path / INSTALL),
         "MLFLOW_DISABLE_TELEMETRY": "true",
     }
     environment.pop("MLFLOW_TRACKING_URI", None)
@@ -99,8 +90,10 @@ def test_the_commands_of_the_site_lead_a_newcomer_to_an_own_method(
         if name == "report":
             assert (tmp_path / folder / "report.html").is_file()
     assert (tmp_path / "my_model/model.onnx").is_file()
-    assert (tmp_path / "my_laplace/pyproject.toml").is_file()
-    comparison = (tmp_path / "outputs/heads/comparison.csv").read_text(encoding="utf-8")
+    own_method = run_tutorial("own_head")
+    seconds["own method"] = float((own_method / "seconds.txt").read_text(encoding="utf-8"))
+    assert (own_method / "my_laplace/pyproject.toml").is_file()
+    comparison = (own_method / "outputs/heads/comparison.csv").read_text(encoding="utf-8")
     assert "my_laplace" in comparison and "gaussian" in comparison
     lines = [f"{name}: {time_of_step:.0f} s" for name, time_of_step in seconds.items()]
     with capsys.disabled():

@@ -78,7 +78,7 @@ def test_the_network_learns_a_known_density(group):
     head = make(hidden=64, layers=2, frequencies=3, training_cells=576, cells=36864)
     concentration = noise_concentration(math.radians(20))
     optimizer = torch.optim.Adam(head.parameters(), 3e-3)
-    raw, identity = torch.zeros(64, 64), torch.tensor([[1.0, 0, 0, 0]]).double()
+    raw, identity = torch.zeros(16, 64), torch.tensor([[1.0, 0, 0, 0]]).double()
 
     def labels(count):
         label = quaternions.product(draw_members(count, group), draw_noise(count, concentration))
@@ -88,7 +88,7 @@ def test_the_network_learns_a_known_density(group):
         for part in optimizer.param_groups:
             part["lr"] = 3e-3 * (1 - step / 600)
         optimizer.zero_grad()
-        head.loss(raw, labels(64)[1].float()).mean().backward()
+        head.loss(raw, labels(16)[1].float()).mean().backward()
         optimizer.step()
     label, angles = labels(4000)
     exact = log_blurred(identity, label, group, concentration) + angles[:, 1].cos().log() - math.log(VOLUME)
