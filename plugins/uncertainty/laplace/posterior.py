@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -68,9 +68,7 @@ def fisher_of_raw(
             constant = _constant_hessian(density, leaf, targets)
             if constant is not None:
                 return constant
-        logs = torch.stack([density.log_prob(target) for target in targets])
-        rows = [torch.autograd.grad(log.sum(), leaf, retain_graph=True)[0] for log in logs]
-    scores = torch.stack(rows, 1).double()  # (batch, target, raw)
+        logs, scores = log_probs_and_scores(density_of, raw, torch.stack(targets))
     if not scores.isfinite().all():
         row = int((~scores.isfinite()).flatten(1).any(1).nonzero()[0])
         raise UserError(
@@ -82,6 +80,36 @@ def fisher_of_raw(
     else:
         weights = scores.new_full(scores.shape[:2], 1 / DRAWS)
     return torch.einsum("bt,bti,btj->bij", weights, scores, scores)
+
+
+def log_probs_and_scores(
+    density_of: Callable[[Tensor], Distribution],
+    raw: Float[Tensor, "batch raw"],
+    targets: Float[Tensor, "target batch ..."] | Int[Tensor, "target batch ..."],
+) -> tuple[Float[Tensor, "target batch"], Float[Tensor, "batch target raw"]]:
+    """Return log p(y | raw), and the scores ∇ log p(y | raw), float64, for several targets y of each sample.
+
+    One derivative of densities of batch_shape (target, batch) gives all scores. If `density_of` returns densities of
+    another shape, or another score for the first targets, then each target has a derivative of its own.
+    """
+    leaf = raw.detach().clone().requires_grad_()
+    density = density_of(leaf)
+    first_log = density.log_prob(targets[0])
+    (first_score,) = torch.autograd.grad(first_log.sum(), leaf, retain_graph=True)
+    copies = raw.detach().expand(len(targets), *raw.shape).clone().requires_grad_()
+    try:
+        logs = density_of(copies).log_prob(targets)
+        (scores,) = torch.autograd.grad(logs.sum(), copies)
+    except (RuntimeError, ValueError, IndexError):  # a model that accepts no further dimension
+        logs, scores = first_log.unsqueeze(0), first_score.unsqueeze(0)
+    rounding = 1e-3 * first_score.abs().sum().item() / max(1, first_score.numel())
+    agrees = logs.shape == targets.shape[:2] and torch.allclose(
+        scores[0], first_score, rtol=1e-3, atol=rounding, equal_nan=True
+    )
+    if not agrees:
+        logs = torch.stack([density.log_prob(target) for target in targets])
+        scores = torch.stack([torch.autograd.grad(log.sum(), leaf, retain_graph=True)[0] for log in logs])
+    return logs, scores.transpose(0, 1).double()
 
 
 def _constant_hessian(
@@ -170,16 +198,22 @@ def draw_deviations(
 ) -> Float[Tensor, "sample raw feature"]:
     """Return deviations of the weights from their mean, of the covariance (H + λ I)⁻¹.
 
+    They are the symmetric root of the covariance times the noise. This root is a continuous function of H and does not
+    depend on the signs of the eigenvectors, so that H from another machine, or from the samples in another order, gives
+    nearly the same deviations.
+
     Args:
         eigen: H.
         precision: λ, 0-dimensional.
         noise: standard normal numbers.
         shape: shape (raw, feature) of the weights.
     """
-    scaled = noise / (eigen.values + precision).sqrt()
+    root = (eigen.values + precision).sqrt()
     if not eigen.vectors:
-        return scaled.unflatten(1, shape)
+        return (noise / root).unflatten(1, shape)
     if len(eigen.vectors) == 1:
-        return (scaled @ eigen.vectors[0].T).unflatten(1, shape)
+        (vectors,) = eigen.vectors
+        return (noise @ vectors / root @ vectors.T).unflatten(1, shape)
     raws, features = eigen.vectors
-    return raws @ scaled.unflatten(1, shape) @ features.T
+    aligned = raws.T @ noise.unflatten(1, shape) @ features
+    return raws @ (aligned / root.unflatten(0, shape)) @ features.T

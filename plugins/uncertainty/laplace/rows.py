@@ -21,7 +21,7 @@ ROWS = {
             identity={},
             leave_out=NO_FIT,
         ),
-        WrapperRow("validation", CLASSES, {"prior_precision": "validation"}, identity={}),
-        WrapperRow("validation, angle", ANGLE, {"prior_precision": "validation", "samples": 5}, identity={}),
+        WrapperRow("validation", CLASSES, {"prior_precision": "validation", "samples": 4}, identity={}),
+        WrapperRow("validation, angle", ANGLE, {"prior_precision": "validation", "samples": 4}, identity={}),
     )
 }

@@ -17,6 +17,7 @@ from plugins.uncertainty.laplace.posterior import (
     collect,
     draw_deviations,
     fisher_of_raw,
+    log_probs_and_scores,
     most_likely_precision,
 )
 from plugins.uncertainty.laplace.wrapper import Laplace
@@ -220,3 +221,46 @@ def test_models_without_one_final_linear_layer_are_refused():
 def test_a_config_out_of_range_is_refused(config):
     with pytest.raises(ConfigError, match=r"uncertainty\."):
         resolve("uncertainty", {"name": "laplace", **config})
+
+
+def test_deviations_do_not_depend_on_the_signs_or_the_order_of_eigenvectors():
+    generator = torch.Generator().manual_seed(5)
+    root = torch.randn(6, 6, generator=generator, dtype=torch.float64)
+    values, vectors = torch.linalg.eigh(root @ root.T)
+    factors = [torch.linalg.eigh(part @ part.T) for part in (root[:2, :2], root[:3, :3])]
+    noise = torch.randn(4, 6, generator=generator, dtype=torch.float64)
+    precision = torch.tensor(0.3, dtype=torch.float64)
+    (raw_values, raws), (feature_values, features) = factors
+    product = torch.outer(raw_values, feature_values)
+    pairs = (
+        (Eigen(values, (vectors,)), Eigen(values.flip(0), (-vectors.flip(1),))),
+        (
+            Eigen(product.flatten(), (raws, features)),
+            Eigen(product.flip(0).flatten(), (-raws.flip(1), features * torch.tensor([1.0, -1.0, 1.0]))),
+        ),
+    )
+    for eigen, same in pairs:
+        torch.testing.assert_close(
+            draw_deviations(eigen, precision, noise, (2, 3)), draw_deviations(same, precision, noise, (2, 3))
+        )
+
+
+@pytest.mark.parametrize("accepts_more_dimensions", [True, False])
+def test_scores_of_several_targets_are_those_of_each_target(accepts_more_dimensions):
+    head = build("density_head", resolve("density_head", "gaussian"), target=REAL)
+    generator = torch.Generator().manual_seed(6)
+    raw = torch.randn(5, 2, generator=generator)
+    targets = torch.randn(4, 5, 1, generator=generator)
+
+    def density_of(raw):
+        if not accepts_more_dimensions and raw.dim() > 2:
+            raw = raw[0] + 1  # another density, of another shape
+        return head(raw)
+
+    logs, scores = log_probs_and_scores(density_of, raw, targets)
+    for number, target in enumerate(targets):
+        leaf = raw.clone().requires_grad_()
+        log_prob = head(leaf).log_prob(target)
+        (expected,) = torch.autograd.grad(log_prob.sum(), leaf)
+        torch.testing.assert_close(logs[number], log_prob)
+        torch.testing.assert_close(scores[:, number], expected.double())
