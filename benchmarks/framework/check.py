@@ -1,11 +1,12 @@
 """Count the planted faults that the contract of density heads finds, and its false alarms.
 
-    python -m benchmarks.framework.check [seeds, 50 by default] [more]
+    python -m benchmarks.framework.check [seeds, 50 by default] [more | names ...]
 
 The planted faults are in tests/planted_faults.py and tests/planted_questions.py. False alarms are counted over the rows
 of all density heads of this project and over the correct density heads of tests/right_heads.py, with several random
 seeds. The results are written to check.md beside this file. With `more` the script continues after the last seed of
-that file, which is valid only if the code has not changed.
+that file, which is valid only if the code has not changed. If names are given, only these density heads are tested, and
+only the section about a later run of the page is written.
 """
 
 import re
@@ -15,7 +16,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.framework.check_parts import change_seed
+from benchmarks.framework.check_parts import change_seed, write_later_run
 from benchmarks.pages import machine, write_page
 from framework.configuration.registry import installed
 from framework.testing.contract import contract
@@ -124,6 +125,10 @@ def read_page() -> tuple[list[str], int, dict[str, list[int]], float]:
 def main() -> None:
     torch.set_num_threads(1)
     start = time.perf_counter()
+    if names := [name for name in sys.argv[2:] if name != "more"]:
+        command = f"python -m benchmarks.framework.check {sys.argv[1]} {' '.join(names)}"
+        write_later_run(PAGE, "density_head", names, int(sys.argv[1]), command)
+        return
     if "more" in sys.argv:
         lines, first, failed, before = read_page()
     else:

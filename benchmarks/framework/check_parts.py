@@ -5,17 +5,19 @@
 GROUP is data, metric, encoder, renderer, uncertainty or objective. The planted faults are in tests/planted_*.py. False
 alarms are counted over the rows of all plugins of the group and over correct plugins that are not part of this project
 (RIGHT in tests/planted_*.py), with several random seeds. The results are written to check_<group>.md beside this file
-after each seed. If names are given, only these plugins of the group are tested.
+after each seed. If names are given, only these plugins are tested, and only the section about a later run of the page
+is written, which says the machine and the date of that run.
 """
 
 import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import torch
 
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, replace_section, write_page
 from framework.configuration.registry import installed
 from framework.testing import finding
 from framework.testing.contract import contract
@@ -38,6 +40,8 @@ from tests import (
 )
 
 Examine = Callable[[], Iterator[Finding]]
+LATER_RUN = "## Plugins tested in a later run"
+"""Heading of the section about the plugins that the run of the whole page did not test, or that changed after it."""
 
 
 def planted_faults(group: str) -> dict[str, Examine]:
@@ -214,11 +218,60 @@ the same time.
     )
 
 
+def write_later_run(page: Path, group: str, names: list[str], seeds: int, command: str) -> None:
+    """Test some plugins of a group with several random seeds, and write the section LATER_RUN after each seed.
+
+    Args:
+        page: Page of the group.
+        group: Name of the group.
+        names: Names of the plugins.
+        seeds: Number of random seeds.
+        command: Command that runs this.
+    """
+    if LATER_RUN not in page.read_text(encoding="utf-8").splitlines():
+        page.write_text(page.read_text(encoding="utf-8") + f"\n{LATER_RUN}\n", encoding="utf-8")
+    seconds: dict[str, list[float]] = {name: [] for name in names}
+    alarms: dict[str, list[str]] = {name: [] for name in names}
+    for seed in range(seeds):
+        change_seed(seed)
+        for name, examine in own_plugins(group, names).items():
+            start = time.process_time()
+            failed = [f"- seed {seed}, {name}: {result}" for result in examine() if not result.holds]
+            seconds[name].append(time.process_time() - start)
+            alarms[name] += failed
+        rows = [
+            f"| {name} | {len(contract(group, name).rows)} | {seed + 1} | {len(alarms[name])} | "
+            f"{statistics.median(durations):.2f} | {min(durations):.2f} to {max(durations):.2f} |"
+            for name, durations in seconds.items()
+        ]
+        text = f"""
+These plugins were added or changed after the run that the sections above describe, and were tested in a run of their
+own. For these plugins, the table replaces what the sections above say. The processor time is that of one thread for all
+constructions, with the median and the range over the random seeds. Other processes ran on the machine at the same time.
+
+| plugin | constructions | seeds | false alarms | median, s | range, s |
+| --- | --- | --- | --- | --- | --- |
+{chr(10).join(rows)}
+
+{chr(10).join(alarm for part in alarms.values() for alarm in part)}
+
+{machine("torch", "numpy")} Command: `{command}`.
+"""
+        replace_section(page, LATER_RUN, text.replace("\n\n\n\n", "\n\n"))
+        sys.stdout.write(f"seed {seed}: {sum(map(len, alarms.values()))} alarms\n")
+        sys.stdout.flush()
+
+
 def main() -> None:
     torch.set_num_threads(1)
     group, seeds = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 20
+    if names := sys.argv[3:]:
+        page = Path(__file__).with_name(f"check_{group}.md")
+        command = f"python -m benchmarks.framework.check_parts {group} {seeds} {' '.join(names)}"
+        write_later_run(page, group, names, seeds, command)
+        return
     plugins = {
-        **own_plugins(group, sys.argv[3:]),
+        **own_plugins(group, []),
         **{f"external: {name}": examine for name, examine in external_plugins(group).items()},
     }
     rows = sum(len(contract(group, name).rows) for name in plugins if not name.startswith("external: "))
