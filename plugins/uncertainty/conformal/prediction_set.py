@@ -11,12 +11,13 @@ from torch.distributions import Distribution, constraints
 
 from framework.distributions.circular import Circular
 from framework.distributions.exported import Exported, exported
+from framework.distributions.intervals import central_interval
 from framework.distributions.protocol import ValueSet, mahalanobis, marginal, value_set
 from framework.distributions.unchanged import Unchanged, outlier_score
 from framework.errors import ConfigError, UserError
 from plugins.uncertainty.conformal.highest_density import Ends, Line
 
-Score = Literal["density", "mass"]
+Score = Literal["density", "mass", "quantiles"]
 FEW = 8
 """Number of values per item up to which `contains` compares their scores with the threshold.
 
@@ -43,16 +44,22 @@ class PredictionSet(Unchanged, ValueSet):
       highest-density region). For classes, a share u(x) in (0, 1) of p(y) itself is added to this probability; u(x)
       looks random, but is a function of the density. Without u(x), the least likely class would always have an infinite
       score, whatever its probability.
+    - "quantiles": max(a - y, y - b) for the ends a and b of the central interval of the stated probability, for one
+      real number in its unit. The set is the interval from a - threshold to b + threshold (conformalised quantile
+      regression; Romano, Patterson & Candès 2019, eq. 6 and 8).
 
-    Both scores are functions of the density and the value alone, as split conformal prediction requires: on
+    All scores are functions of the density and the value alone, as split conformal prediction requires: on
     exchangeable data the set has its stated coverage for any density (Vovk, Gammerman & Shafer 2005, §4.1).
     For a target of several numbers, probabilities are shares of random samples, which are drawn once.
 
     Args:
         density: any density.
         threshold: the largest score in the set, a scalar; infinite for all values.
-        score: "density" or "mass".
+        score: "density", "mass" or "quantiles".
         stated_probability: probability with which the set is stated to hold the target; None if it is not known.
+
+    Raises:
+        ConfigError: the score is "quantiles", and the density is not over one real number, or no probability is stated.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -67,11 +74,30 @@ class PredictionSet(Unchanged, ValueSet):
         self.stated_probability = stated_probability
         self.threshold = threshold
         self.score: Score = score
+        if score == "quantiles" and stated_probability is None:
+            raise ConfigError("The score quantiles needs the stated probability of the interval. Pass one.")
+        if score == "quantiles" and (
+            density.has_enumerate_support
+            or tuple(density.event_shape) != (1,)
+            or isinstance(density.support, Circular)
+        ):
+            raise ConfigError(
+                "uncertainty.conformal.score=quantiles moves the two ends of an interval of one real number, but the "
+                f"predicted density is a {type(density).__name__} of event_shape {tuple(density.event_shape)}. Choose "
+                "score=density or score=mass."
+            )
         super().__init__(density)
 
     @torch.no_grad()
     def scores(self, value: Tensor) -> Float[Tensor, "*shape"]:
-        """Return the score of each value (*sample, *batch, *event), nats, float64; larger is less expected."""
+        """Return the score of each value (*sample, *batch, *event), float64; larger is less expected.
+
+        It is in nats, and for "quantiles" in the unit of the target.
+        """
+        if self.score == "quantiles":
+            low, high = self._central
+            number = value.double().squeeze(-1)
+            return torch.maximum(low - number, number - high)
         log_prob = self.density.log_prob(value).double()
         if self.score == "density":
             return -log_prob
@@ -284,7 +310,23 @@ class PredictionSet(Unchanged, ValueSet):
 
     @cached_property
     @torch.no_grad()
+    def _central(self) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+        """Ends of the central interval of the stated probability."""
+        assert self.stated_probability is not None
+        interval = central_interval(self.density, self.stated_probability)
+        return interval.low.squeeze(-1), interval.high.squeeze(-1)
+
+    @cached_property
+    @torch.no_grad()
     def _ends(self) -> Ends:
+        if self.score == "quantiles":
+            threshold = self.threshold.double()
+            low, high = (
+                (end + sign * threshold).flatten() for end, sign in zip(self._central, (-1, 1), strict=True)
+            )
+            pairs = zip(low.tolist(), high.tolist(), strict=True)
+            intervals = [[(start, end)] if start <= end else [] for start, end in pairs]
+            return Ends((high - low).clamp(min=0), intervals)
         return self._line.ends(self._level)
 
 
@@ -360,8 +402,8 @@ def _(density: PredictionSet, index: int) -> Distribution:
 def _(density: PredictionSet) -> Exported:
     if density.score != "density":
         raise ConfigError(
-            "A prediction set with score=mass cannot be exported, because its region depends on the whole density of "
-            "each input. Calibrate the model with score=density, or use framework.load for this model."
+            f"A prediction set with score={density.score} cannot be exported, because its region depends on the whole "
+            "density of each input. Calibrate the model with score=density, or use framework.load for this model."
         )
     # JSON has no infinite numbers
     # the trace of an exported model depends on no value; its layout is read outside of the trace

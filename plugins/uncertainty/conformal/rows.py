@@ -1,17 +1,21 @@
-"""Contract-test cases: both scores on every kind of target."""
+"""Contract-test cases: two scores on every kind of target, and quantiles of one real number."""
 
 from framework.target import Target
 from framework.testing.rows import ANGLE, CLASSES, REALS, WrapperRow
 
+HEIGHT = Target("real", ("height",))
 ROWS = {
-    "conformal": tuple(
-        WrapperRow(f"{name}, {score}", target, {"score": score}, identity={})
-        for score in ("density", "mass")
-        for name, target in {
-            "classes": CLASSES,
-            "one angle": ANGLE,
-            "one real": Target("real", ("height",)),
-            "two reals": REALS,
-        }.items()
+    "conformal": (
+        *(
+            WrapperRow(f"{name}, {score}", target, {"score": score}, identity={})
+            for score in ("density", "mass")
+            for name, target in {
+                "classes": CLASSES,
+                "one angle": ANGLE,
+                "one real": HEIGHT,
+                "two reals": REALS,
+            }.items()
+        ),
+        WrapperRow("one real, quantiles", HEIGHT, {"score": "quantiles"}, identity={}),
     )
 }

@@ -13,7 +13,7 @@ from framework.configuration.schema import build, resolve
 from framework.distributions.batch_shapes import Stacked
 from framework.distributions.density import Mixture
 from framework.errors import ConfigError, UserError
-from framework.model import Predictor
+from framework.model import Model, Predictor
 from framework.target import Target
 from framework.testing.metrics import Cardioid
 from plugins.uncertainty.conformal.prediction_set import PredictionSet
@@ -250,3 +250,83 @@ def test_bad_sets_get_a_sentence():
 def test_a_config_out_of_range_is_refused(config):
     with pytest.raises(ConfigError, match="uncertainty"):
         around(PredictorOf(sure_classifier), **config)
+
+
+def spread_pairs(count, generator):
+    """Return inputs, and numbers whose noise grows with the input, float64."""
+    inputs = generator.uniform(0, 3, (count, 1))
+    return torch.from_numpy(inputs), torch.from_numpy(
+        inputs + (0.1 + inputs**2) * generator.normal(size=(count, 1))
+    )
+
+
+def quantile_model():
+    torch.manual_seed(0)
+    height = Target("real", ("height",))
+    head = build("density_head", resolve("density_head", "quantiles"), target=height)
+    return Model([], head, (1,)).double()
+
+
+@pytest.mark.parametrize("miscoverage", [0.1, 0.3])
+def test_quantiles_are_conformalised_as_romano_et_al_state(miscoverage):
+    """Compare with eq. 5-8 of Romano, Patterson & Candès 2019, written out, for quantiles of the head `quantiles`."""
+    height, model = Target("real", ("height",)), quantile_model()
+    inputs, target = spread_pairs(301, np.random.default_rng(0))
+    wrapper = around(model, height, score="quantiles", miscoverage=miscoverage)
+    wrapper.calibrate(batches(inputs, target))
+    _, own_half = split_in_halves(list(batches(inputs, target)))
+    levels = [
+        round(20 * level) - 1 for level in (miscoverage / 2, 1 - miscoverage / 2)
+    ]  # of 1/20, ..., 19/20
+
+    def quantiles(rows):
+        with torch.no_grad():
+            return [model(rows).quantiles[:, level].numpy() for level in levels]
+
+    rows, values = (torch.cat([batch[name] for batch in own_half]) for name in ("input", "target"))
+    low, high = quantiles(rows)
+    scores = np.sort(np.maximum(low - values[:, 0].numpy(), values[:, 0].numpy() - high))
+    moved = scores[math.ceil((len(scores) + 1) * (1 - miscoverage)) - 1]
+    assert wrapper.threshold.item() == pytest.approx(moved, rel=1e-9)
+    new, value = spread_pairs(40, np.random.default_rng(1))
+    with torch.no_grad():
+        sets = wrapper(new)
+    low, high = quantiles(new)
+    expected = np.stack([low - moved, high + moved], 1)
+    np.testing.assert_allclose(np.array(sets.intervals())[:, 0], expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(sets.size(), expected[:, 1] - expected[:, 0], rtol=1e-9)
+    inside = (value[:, 0].numpy() >= expected[:, 0]) & (value[:, 0].numpy() <= expected[:, 1])
+    assert sets.contains(value).tolist() == inside.tolist() and not sets.empty().any()
+    assert not sets.size_error().any()
+
+
+def test_conformalised_quantiles_hold_the_stated_share_over_validation_splits():
+    height, model = Target("real", ("height",)), quantile_model()
+    generator = np.random.default_rng(2)
+    covered = []
+    for _ in range(150):
+        inputs, target = spread_pairs(200, generator)
+        wrapper = around(model, height, score="quantiles", miscoverage=0.2)
+        wrapper.calibrate(batches(inputs, target))
+        with torch.no_grad():
+            new, value = spread_pairs(400, generator)
+            covered.append(wrapper(new).contains(value).double().mean().item())
+    # 1 - α to 1 - α + 1/(n + 1), n = 100; the error of the mean is that of 150 splits
+    error = np.std(covered) / math.sqrt(150)
+    assert 0.8 - 3 * error < np.mean(covered) < 0.8 + 1 / 101 + 3 * error
+
+
+def test_quantiles_of_other_targets_are_refused_and_a_narrowed_interval_may_be_empty():
+    for inner, target in ((sure_classifier, CLASSES), (sure_direction, ANGLE)):
+        with pytest.raises(ConfigError, match=r"score=quantiles moves the two ends .* of one real number"):
+            around(PredictorOf(inner), target, score="quantiles")(torch.zeros(3, 2))
+    normal = torch.distributions.Independent(
+        torch.distributions.Normal(torch.zeros(2, 1), torch.ones(2, 1)), 1
+    )
+    narrowed = PredictionSet(normal, torch.tensor(-2.0), "quantiles", 0.9)
+    assert narrowed.empty().all() and narrowed.intervals() == [[], []] and not narrowed.size().any()
+    assert not narrowed.contains(torch.zeros(2, 1)).any()
+    whole = PredictionSet(normal, torch.tensor(math.inf), "quantiles", 0.9)
+    assert whole.intervals() == [[(-math.inf, math.inf)]] * 2 and whole.contains(torch.zeros(2, 1)).all()
+    with pytest.raises(ConfigError, match="needs the stated probability"):
+        PredictionSet(normal, torch.tensor(0.0), "quantiles")

@@ -45,16 +45,19 @@ class Conformal(Uncertainty):
     Args:
         miscoverage: α, the share of targets that may lie outside.
         score: "density": one level of density for all inputs, which gives the smallest sets on average; "mass": one
-            probability for all inputs, which gives larger sets where the model is uncertain.
+            probability for all inputs, which gives larger sets where the model is uncertain; "quantiles", for one real
+            number: the central interval of probability 1 - α, with both ends moved by one distance for all inputs
+            (conformalised quantile regression; Romano, Patterson & Candès 2019).
 
     Attributes:
-        threshold: the largest score in a set, nats, a float64 buffer.
+        threshold: the largest score in a set, nats (for "quantiles" in the unit of the target), a float64 buffer.
 
     Raises:
+        ConfigError: the score is "quantiles", and the target is not one real number.
         UserError: there are fewer than 2 validation samples, or a score is NaN (the message names the samples).
     """
 
-    bibtex = "vovk2005algorithmic, sadinle2019least, romano2020classification"
+    bibtex = "vovk2005algorithmic, sadinle2019least, romano2020classification, romano2019conformalized"
     threshold: Tensor
 
     def __init__(
@@ -85,7 +88,7 @@ class Conformal(Uncertainty):
             )
         self.model.calibrate(model_half)
         sets = [
-            PredictionSet(density, self.threshold, self.score)
+            PredictionSet(density, self.threshold, self.score, 1 - self.miscoverage)
             for density in predict_densities(self.model, own_half)
         ]
         scores = torch.cat(
