@@ -102,10 +102,10 @@ def error_at_coverage(
     risk = risk.double()
     _, group, size = confidence.neg().unique(return_inverse=True, return_counts=True)
     expected = (risk.new_zeros(len(size)).index_add_(0, group, risk) / size).repeat_interleave(size)
-    kept, reach = _kept_count(count, coverage), math.isqrt(count)
-    at_quantile = expected[max(kept - reach, 0) : kept + reach + 1].mean()
-    share = kept / count
+    kept_count, reach = _kept_count(count, coverage), math.isqrt(count)
+    at_quantile = expected[max(kept_count - reach, 0) : kept_count + reach + 1].mean()
+    share = kept_count / count
     start = (size.cumsum(0) - size)[group]
-    above = ((kept - start).double() / size[group]).clamp(0, 1)
-    influence = above * (risk - at_quantile) / share + at_quantile - expected[:kept].mean()
+    above = ((kept_count - start).double() / size[group]).clamp(0, 1)
+    influence = above * (risk - at_quantile) / share + at_quantile - expected[:kept_count].mean()
     return influence.std() / math.sqrt(count)

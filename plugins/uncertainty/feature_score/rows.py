@@ -1,13 +1,7 @@
 """Contract-test cases: each distance, for classes, angles and real numbers."""
 
-from framework.target import Target
-from framework.testing.rows import WrapperRow
+from framework.testing.rows import ANGLE, CLASSES, REALS, WrapperRow
 
-CLASSES, ANGLE, REALS = (
-    Target("class", ("a", "b", "c")),
-    Target("angle", ("azimuth",)),
-    Target("real", ("x", "y")),
-)
 ROWS = {
     "feature_score": (
         WrapperRow("Mahalanobis, classes", CLASSES, identity={}),
