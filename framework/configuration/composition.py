@@ -1,5 +1,6 @@
 """Composition of a config with Hydra, and translation of Hydra's errors into one sentence."""
 
+import os
 import re
 import shlex
 import textwrap
@@ -71,6 +72,14 @@ class PluginFolder(FileConfigSource):
                 "plugins, or rename the config in one of them. All other configs still work."
             )
         return super().load_config(config_path)
+
+    # Hydra asks each plugin's folder for each config of a command, and would resolve 2,000 paths.
+
+    def is_group(self, config_path: str) -> bool:
+        return os.path.isdir(os.path.join(self.path, config_path))  # noqa: PTH112, PTH118
+
+    def is_config(self, config_path: str) -> bool:
+        return os.path.isfile(os.path.join(self.path, self._normalize_file_name(config_path)))  # noqa: PTH113, PTH118
 
 
 def register() -> None:
