@@ -20,6 +20,7 @@ from scipy.stats import vonmises
 
 from framework.distributions.density import Mixture
 from framework.figures.style import save_figure, titled_figure
+from framework.reports.interval_picture import Intervals, draw_intervals
 from framework.reports.prediction_pictures import deviation, log_density_on_circle
 from framework.reports.table import aggregate
 from framework.reports.tradeoff_picture import Floor, error_against_run_time
@@ -575,6 +576,32 @@ def test_a_result_alone_stands_in_the_middle_of_its_panels(
             axes.transData.transform([(time, error) for time in times])
         )
         assert (places > 0.04).all() and (places < 0.96).all(), places
+
+
+def test_intervals_are_drawn_in_the_order_of_predictions_and_counted(tmp_path: Path) -> None:
+    """Ends that are infinite reach the edges of the panel; an empty interval (NaN) contains nothing."""
+    numbers = [
+        Intervals(
+            "$y_0$ < 3",
+            0.9,
+            low=np.array([0.0, -math.inf, math.nan, 5.0]),
+            high=np.array([2.0, math.inf, math.nan, 6.0]),
+            point=np.array([4.0, 1.0, 3.0, 2.0]),
+            truth=np.array([1.0, 100.0, 3.0, 7.0]),
+        ),
+        Intervals("constant", 0.55, *(np.full(4, 2.0) for _ in range(4))),
+    ]
+    figure = draw_intervals(numbers, title="a table", synthetic=True)
+    assert "2 of 4 true values are inside (50 %; stated: 90 %)" in words(figure)
+    assert "4 of 4 true values are inside (100 %; stated: 55 %)" in words(figure)
+    assert "a table (synthetic data)" in words(figure) and "$y_0$ < 3" in words(figure)
+    first = figure.axes[0]
+    lines = {line.get_label(): line.get_xydata() for line in first.get_lines()}
+    assert lines["prediction"][:, 1].tolist() == [1.0, 2.0, 3.0, 4.0]
+    assert lines["true value, inside"].tolist() == [[0.0, 100.0], [3.0, 1.0]]
+    assert lines["true value, outside"].tolist() == [[1.0, 7.0], [2.0, 3.0]]
+    assert first.get_ylim()[1] > 100
+    drawn(figure, tmp_path)
 
 
 def test_many_methods_and_classes_stay_apart(tmp_path: Path) -> None:

@@ -11,19 +11,24 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torch.utils.data import Subset
 
-from framework.data import Data
+from framework.data import Batch, Data
 from framework.distributions.circular import angular_distance, wrap
 from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.density import circular_grid
 from framework.distributions.noise import Draw
+from framework.distributions.protocol import value_set
+from framework.evaluation.prediction_sets import set_columns
 from framework.evaluation.splits import on_device, predict
 from framework.reports.class_picture import choose_classified, draw_classified
+from framework.reports.interval_picture import Intervals, draw_intervals
 from framework.reports.landscape_picture import Plane, draw_landscapes, half_width, probabilities
 from framework.reports.viewing_circles import choose, viewing_circles
 from framework.runs.session import Session
 
 PICTURED = 128
 """Number of test samples from which the samples of a figure are chosen."""
+MOST_NUMBERS, MASS = 4, 0.9
+"""Largest number of real numbers whose intervals are drawn, and the probability of an interval that no set states."""
 POINTS = 720
 """Number of angles at which a density on the circle is drawn."""
 UNRESOLVED, DRAWS, TIMES = 0.01, 1000, 10
@@ -42,6 +47,8 @@ def prediction_pictures(session: Session) -> Iterator[tuple[str, Figure]]:
         yield "landscape", _landscape_figure(session)
     elif kind == "class":
         yield "classified", _classified_figure(session)
+    if kind == "real" and len(session.target.names) <= MOST_NUMBERS:
+        yield "predicted_intervals", _intervals_figure(session)
 
 
 @torch.no_grad()
@@ -88,12 +95,9 @@ def _densities_figure(session: Session) -> Figure:
 def _classified_figure(session: Session) -> Figure:
     """Return the figure of classified test samples, chosen from PICTURED samples at equal distances in the split."""
     predictor, data = session.predictor, session.data
-    dataset = data.splits().test
-    length: int = len(dataset)  # pyright: ignore[reportArgumentType]
-    subset = Subset(dataset, np.unique(np.linspace(0, length - 1, PICTURED).round().astype(int)).tolist())
     inputs: list[Tensor] = []
     shares, labels = [np.zeros((0, len(data.target.names)))], [np.zeros(0, np.int64)]
-    for batch in on_device(session.blocks().of(subset), session.device):
+    for batch in _spread_batches(session):
         shares.append(class_probabilities(predictor(batch["input"])).cpu().numpy())
         labels.append(batch["target"].cpu().numpy())
         inputs.extend(batch["input"].cpu())
@@ -109,6 +113,46 @@ def _classified_figure(session: Session) -> Figure:
         title=f"{session.title}: samples of the test split",
         synthetic=data.synthetic,
     )
+
+
+@torch.no_grad()
+def _intervals_figure(session: Session) -> Figure:
+    """Return the figure of prediction intervals, for PICTURED samples at equal distances in the test split.
+
+    The intervals are the prediction sets of one number if the model predicts them, and otherwise the central intervals
+    with the probability MASS.
+    """
+    target, settings = session.target, session.settings
+    mass, parts = MASS, []
+    for number, batch in enumerate(_spread_batches(session)):
+        prediction = predict(session.predictor, batch, settings.samples, Draw(settings.seed, number))
+        sets = value_set(prediction.density)
+        if sets is not None and sets.stated_probability is not None and len(target.names) == 1:
+            mass = sets.stated_probability
+            columns = set_columns(target, prediction)
+            low, high = (
+                torch.tensor(columns[f"{target.names[0]}_{end}"])[:, None] for end in ("low", "high")
+            )
+        else:
+            low, high, *_ = prediction.interval(mass)
+        parts.append([part.double().cpu().numpy() for part in (low, high, prediction.point, batch["target"])])
+    low, high, point, truth = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return draw_intervals(
+        [
+            Intervals(name, mass, low[:, index], high[:, index], point[:, index], truth[:, index])
+            for index, name in enumerate(target.names)
+        ],
+        title=f"{session.title}: prediction intervals of test samples",
+        synthetic=session.data.synthetic,
+    )
+
+
+def _spread_batches(session: Session) -> Iterator[Batch]:
+    """Yield batches, on the session's device, of PICTURED samples at equal distances in the test split."""
+    dataset = session.data.splits().test
+    length: int = len(dataset)  # pyright: ignore[reportArgumentType]
+    rows = np.unique(np.linspace(0, length - 1, PICTURED).round().astype(int)).tolist()
+    yield from on_device(session.blocks().of(Subset(dataset, rows)), session.device)
 
 
 def _landscape_figure(session: Session) -> Figure:
