@@ -35,7 +35,7 @@ class Intervals(NamedTuple):
 
     @property
     def inside(self) -> Bool[np.ndarray, "sample"]:
-        """Whether each true value lies in its interval, (sample,)."""
+        """Return whether each true value lies in its interval, (sample,)."""
         return (self.low <= self.truth) & (self.truth <= self.high)
 
 
