@@ -32,6 +32,7 @@ SCORES: dict[str, dict[str, Any] | None] = {
     "nearest neighbours, not normalised": {"method": "knn", "normalise": False},
 }
 """Scores by name: settings of `feature_score`, or None for scores of the density."""
+MOONS_EPOCHS, DIGITS_EPOCHS = 100, 3
 ROUNDS = 5
 """Number of repetitions of a timed prediction."""
 TABLE = Path(__file__).with_name("outlier_scores_runs.csv")
@@ -168,8 +169,8 @@ def page() -> None:
         "are computed from the predicted density, and all others from the features that the final layer reads "
         "(`uncertainty=[feature_score]`). AUROC is the probability that a random outlier has a higher score than a "
         "random test sample; FPR95 is the share of test samples that a threshold classifies as outliers if it detects "
-        f"95 % of the outliers. The numbers are means over {len(SEEDS)} seeds (of training and, for moons and digits, "
-        "of data or split), and ± is the standard deviation over seeds. Settings are the defaults of "
+        f"95 % of the outliers. The numbers are means over {len(SEEDS)} seeds of the training and of the data "
+        "(for digits, of their split), and ± is the standard deviation over seeds. Settings are the defaults of "
         "`feature_score`, except where the name of the score says otherwise; none was tuned.",
     ]
     for data, heading in (
@@ -182,10 +183,10 @@ def page() -> None:
         accuracies = [row["accuracy"] for row in own if row["score"] == "entropy"]
         texts = {
             "moons": "The outliers lie far from both moons, on one side (`data=moons_outliers`). The network has two "
-            "layers of 512 units.",
+            f"layers of 512 units, trained for {MOONS_EPOCHS} epochs.",
             "digits": "A small convolutional network (`biternion_vgg`) is trained on the digits 0 to 7 among the "
-            "10,000 test images of MNIST, split at random. Outliers are digits of the other two classes, 8 and 9, "
-            "and images of objects (COIL-20).",
+            f"10,000 test images of MNIST, split at random, for {DIGITS_EPOCHS} epochs. Outliers are digits of the "
+            "other two classes, 8 and 9, and images of objects (COIL-20).",
         }
         lines += [
             "",
@@ -233,10 +234,10 @@ def main() -> None:
     if options.step == "page":
         page()
     elif options.set == "moons":
-        measure("moons", load_moons, {"name": "mlp", "widths": [512, 512]}, 100)
+        measure("moons", load_moons, {"name": "mlp", "widths": [512, 512]}, MOONS_EPOCHS)
     else:
         encoder = {"name": "biternion_vgg", "convolution_dropout": 0.0, "dropout": 0.1}
-        measure("digits", lambda seed: load_digits(seed, *options.folders), encoder, 3)
+        measure("digits", lambda seed: load_digits(seed, *options.folders), encoder, DIGITS_EPOCHS)
 
 
 if __name__ == "__main__":
