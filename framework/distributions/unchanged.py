@@ -21,8 +21,6 @@ class Unchanged(Mixture):
         density: any density.
     """
 
-    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
-
     def __init__(self, density: Distribution) -> None:
         self.density = density
         # The dtype of log_prob: for classes that of one label's, otherwise that of an empty sample.

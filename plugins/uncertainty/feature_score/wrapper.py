@@ -1,7 +1,7 @@
 """Outlier scores from the features in front of the final layer, beside an unchanged density."""
 
 from collections.abc import Callable, Iterable, Iterator
-from typing import Annotated, Any, Literal, NamedTuple, cast
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -9,6 +9,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
+from framework.calibration.final_layer import find_final_layer, run_final_layer
 from framework.calibration.validation import nonempty_batches
 from framework.data import Batch
 from framework.distributions.class_probabilities import class_probabilities
@@ -292,18 +293,14 @@ def network_of(predictor: Predictor) -> Network:
                 "several models, or computes several together. Leave one of the two out of uncertainty."
             )
         model = models[0]
-    if isinstance(model, Model):
-        layer: nn.Module | None = model.projection
-    else:
-        layers = [module for module in model.modules() if isinstance(module, nn.Linear)]
-        layer = layers[-1] if layers else None
-    if not isinstance(layer, nn.Linear):
+    layer = find_final_layer(model)
+    if layer is None:
         raise ConfigError(
             "uncertainty feature_score reads the features in front of the final linear layer, but this model has no "
             "such layer: its head reads the features themselves, or is fitted at once, or has several networks. Choose "
             "another density_head, or leave feature_score out."
         )
-    return Network(model, cast(nn.Linear, layer))
+    return Network(model, layer)
 
 
 def run_network(predictor: Predictor, inputs: Tensor) -> Pass:
@@ -313,27 +310,11 @@ def run_network(predictor: Predictor, inputs: Tensor) -> Pass:
         ConfigError: a predictor that is no `Model` calls its final layer several times, or not with vectors.
     """
     model, layer = network_of(predictor)
+    features, raw, density = run_final_layer(model, layer, inputs, by="feature_score")
     if isinstance(model, Model):
-        features = model.encoders(inputs)
-        raw = layer(features)
-        return Pass(features, raw, model.head(raw) if predictor is model else predictor(inputs))
-    calls: list[tuple[Tensor, Tensor]] = []
-
-    def record(_: nn.Module, arguments: tuple[Any, ...], output: Any) -> None:
-        calls.append((arguments[0], output))
-
-    hook = layer.register_forward_hook(record)
-    try:
-        density = predictor(inputs)
-    finally:
-        hook.remove()
-    if len(calls) != 1 or calls[0][0].dim() != 2:
-        raise ConfigError(
-            "uncertainty feature_score needs a model that calls its final linear layer once with one vector for each "
-            f"input, but {type(predictor).__name__} calls it {len(calls)} times, or with features of other dimensions. "
-            "Leave feature_score out."
-        )
-    return Pass(*calls[0], density)
+        density = model.head(raw) if predictor is model else predictor(inputs)
+    assert density is not None
+    return Pass(features, raw, density)
 
 
 def require_logits(predictor: Predictor, inputs: Tensor) -> None:

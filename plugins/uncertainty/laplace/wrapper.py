@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from framework.calibration.equal_mixture import equal_mixture
+from framework.calibration.final_layer import find_final_layer, run_final_layer
 from framework.calibration.validation import nonempty_batches, require_numbers
 from framework.calibration.weight_draws import weight_noise
 from framework.data import Batch
@@ -218,27 +219,7 @@ class Laplace(Uncertainty, ReadsTraining):
     def _features_and_raw(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return what the final layer reads, with a 1 appended if it has a bias, and what it returns."""
         layer = final_layer(self.model)
-        if isinstance(self.model, Model):
-            features = self.model.encoders(inputs)
-            raw = layer(features)
-        else:
-            calls: list[tuple[Tensor, Tensor]] = []
-
-            def record(_: nn.Module, arguments: tuple[Any, ...], output: Any) -> None:
-                calls.append((arguments[0], output))
-
-            hook = layer.register_forward_hook(record)
-            try:
-                self.model(inputs)
-            finally:
-                hook.remove()
-            features, raw = calls[0] if len(calls) == 1 else (inputs, inputs.unsqueeze(-1))
-            if len(calls) != 1 or features.dim() != 2:
-                raise ConfigError(
-                    "uncertainty laplace needs a model that calls its final linear layer once with one vector for each "
-                    f"input, but {type(self.model).__name__} calls it {len(calls)} times, with features of "
-                    f"{features.dim() - 1} dimensions. Choose another uncertainty."
-                )
+        features, raw, _ = run_final_layer(self.model, layer, inputs, by="laplace")
         if layer.bias is not None:
             features = torch.cat([features, torch.ones_like(features[:, :1])], 1)
         return features, raw
@@ -265,15 +246,11 @@ def final_layer(model: Predictor) -> nn.Linear:
             f"uncertainty laplace wraps a single model, but got {type(model).__name__}. Put laplace first: "
             "uncertainty=[laplace,...]; the next wrapper is then around it."
         )
-    if isinstance(model, Model):
-        layer: nn.Module | None = model.projection
-    else:
-        layers = [module for module in model.modules() if isinstance(module, nn.Linear)]
-        layer = layers[-1] if layers else None
-    if not isinstance(layer, nn.Linear):
+    layer = find_final_layer(model)
+    if layer is None:
         raise ConfigError(
             "uncertainty laplace draws the weights of the linear layer in front of the density head, but this model "
             "has no such layer: its head reads the features themselves, or is fitted at once, or has several networks. "
             "Choose another density_head, or another uncertainty."
         )
-    return cast(nn.Linear, layer)
+    return layer
