@@ -4,13 +4,13 @@ from collections.abc import Collection
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution, constraints
+from torch.distributions import Distribution
 
 from framework.distributions import protocol
-from framework.distributions.description import PlainDensity
+from framework.distributions.description import DerivedDensity
 
 
-class AffineDensity(PlainDensity):
+class AffineDensity(DerivedDensity):
     """Density of X = location + scale · Y, for a vector Y of n numbers; each number has its own location and scale.
 
     Args:
@@ -26,14 +26,9 @@ class AffineDensity(PlainDensity):
                 f"The location has the shape {tuple(location.shape)} and the scale {tuple(scale.shape)}, but the "
                 f"density is over {tuple(shape)}; expected the same shape (*batch, number) for all three."
             )
-        self.density = density
+        super().__init__(density)
         self.location = location
         self.scale = scale
-        super().__init__(density.batch_shape, density.event_shape, validate_args=False)
-
-    @property
-    def support(self) -> constraints.Constraint | None:
-        return self.density.support
 
     @property
     def log_volume(self) -> Tensor:

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions import protocol
-from framework.distributions.description import PlainDensity
+from framework.distributions.description import DerivedDensity, PlainDensity
 from framework.distributions.shapes import broadcast_shapes, unravel_index
 
 
@@ -80,7 +80,7 @@ class Stacked(PlainDensity):
         return torch.stack([density.entropy() for density in self.densities], -1)
 
 
-class Reshaped(PlainDensity):
+class Reshaped(DerivedDensity):
     """A density whose batch_shape is replaced by another one with as many items; the order of the items stays.
 
     Args:
@@ -96,13 +96,8 @@ class Reshaped(PlainDensity):
                 f"A batch of densities with batch_shape {tuple(density.batch_shape)} cannot get the batch_shape "
                 f"{tuple(shape)}; expected the same number of densities."
             )
-        self.density = density
+        super().__init__(density, shape)
         self.has_enumerate_support = density.has_enumerate_support
-        super().__init__(shape, density.event_shape, validate_args=False)
-
-    @property
-    def support(self) -> constraints.Constraint | None:
-        return self.density.support
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
         """Return every class, (class, *batch); without `expand`, all dimensions after the first have length 1."""

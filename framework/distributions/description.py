@@ -35,6 +35,25 @@ class PlainDensity(Distribution):
     __repr__ = one_line
 
 
+class DerivedDensity(PlainDensity):
+    """Base class of densities that are computed from another density and have its support.
+
+    Args:
+        density: the other density.
+        batch_shape: batch_shape of the result; None for that of `density`.
+    """
+
+    def __init__(self, density: Distribution, batch_shape: torch.Size | None = None) -> None:
+        self.density = density
+        shape = density.batch_shape if batch_shape is None else batch_shape
+        super().__init__(shape, density.event_shape, validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint | None:
+        """Support of the density."""
+        return self.density.support
+
+
 class CategoricalDensity(Categorical):
     """torch's categorical density, printed as one line (`one_line`) like the project's own densities."""
 

@@ -8,11 +8,11 @@ from functools import cached_property
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.distributions import Distribution, constraints
+from torch.distributions import Distribution
 
 from framework.distributions.circular import Circular, grid, wrap
 from framework.distributions.density import Mixture
-from framework.distributions.description import CategoricalDensity, PlainDensity
+from framework.distributions.description import CategoricalDensity, DerivedDensity
 from framework.distributions.protocol import (
     Estimate,
     QuadraticBound,
@@ -172,7 +172,7 @@ def _(density: RescaledClasses, value: Tensor) -> Estimate:
     return estimate_with_error(log_prob, *fields)
 
 
-class CircularPower(PlainDensity):
+class CircularPower(DerivedDensity):
     """The density p^(1/T) / Z for a density p of one angle; Z is computed by the trapezium rule on a grid.
 
     The grid starts at the mode, so that no peak is missed there. It is refined until it resolves the power and until p
@@ -194,9 +194,8 @@ class CircularPower(PlainDensity):
     """
 
     def __init__(self, density: Distribution, temperature: Tensor) -> None:
-        self.density = density
+        super().__init__(density)
         self.temperature = temperature
-        super().__init__(density.batch_shape, density.event_shape, validate_args=False)
         self.start = density.mode.detach() if density.batch_shape.numel() else density.sample()
         self.stretch = torch.ones_like(self.start, dtype=torch.float64)
         self.points = POINTS
@@ -273,10 +272,6 @@ class CircularPower(PlainDensity):
         width = (-self.density.log_prob(self.start).detach().double()).exp() / math.sqrt(2 * math.pi)
         width = width * self.temperature.detach().double().sqrt()
         return (NARROWEST * width).nan_to_num(nan=1.0).clamp(1e-12, 1).unsqueeze(-1)
-
-    @property
-    def support(self) -> constraints.Constraint | None:
-        return self.density.support
 
     @property
     def mode(self) -> Tensor:

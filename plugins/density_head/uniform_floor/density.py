@@ -5,11 +5,11 @@ from collections.abc import Collection
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution, constraints
+from torch.distributions import Distribution
 
 from framework.distributions.circular import Circular
 from framework.distributions.density import estimate_of_sum
-from framework.distributions.description import PlainDensity
+from framework.distributions.description import DerivedDensity
 from framework.distributions.exported import Exported, exported
 from framework.distributions.panels import entropy_of_one, has_range
 from framework.distributions.protocol import (
@@ -31,7 +31,7 @@ from framework.distributions.tempering import tempered_classes
 from framework.distributions.uniform import uniform
 
 
-class Floored(PlainDensity):
+class Floored(DerivedDensity):
     """Mixture (1 - γ) p + γ u of a density p and a uniform density u, the floor.
 
     Args:
@@ -41,16 +41,10 @@ class Floored(PlainDensity):
     """
 
     def __init__(self, density: Distribution, weight: float, floor: Distribution | None = None) -> None:
-        self.density = density
+        super().__init__(density)
         self.weight = weight
         self.floor = uniform(density) if floor is None else floor
         self.has_enumerate_support = density.has_enumerate_support
-        super().__init__(density.batch_shape, density.event_shape, validate_args=False)
-
-    @property
-    def support(self) -> constraints.Constraint | None:
-        """Support of the density."""
-        return self.density.support
 
     @property
     def mode(self) -> Tensor:
