@@ -197,16 +197,16 @@ class _Cdf(Function):
         return grad * density, -grad * density, grad * by_concentration
 
 
-def _log_quotient(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Return log((κ₂+2)/(κ₁+2)) for κ₁ in `first` and κ₂ in `second`, and whether its magnitude is at most 1.
+def _log_quotient(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return log((κ₂+2)/(κ₁+2)) for κ₁ in `first` and κ₂ in `second`, whether its magnitude is at most 1, and a step.
 
-    If it is, integrals from κ₁ to κ₂ are computed by quadrature, because a difference of antiderivatives would lose
-    digits.
+    If it is, integrals from κ₁ to κ₂ are computed by quadrature in log(x+2), because a difference of antiderivatives
+    would lose digits. The step of the quadrature is this logarithm, and 0 elsewhere.
     """
     quotient = torch.log((second + 2) / (first + 2))
     near = quotient.abs() <= 1
     exact = torch.log1p(torch.where(near, (second - first) / (first + 2), 0))
-    return torch.where(near, exact, quotient), near
+    return torch.where(near, exact, quotient), near, torch.where(near, exact, 0)
 
 
 class _Bregman(Function):
@@ -218,11 +218,10 @@ class _Bregman(Function):
     @staticmethod
     def forward(ctx: Any, first: Tensor, second: Tensor) -> Tensor:
         ctx.save_for_backward(first, second)
-        log, near = _log_quotient(first, second)
-        step = torch.where(near, log, 0)
+        log, near, step = _log_quotient(first, second)
         v = 2 / (first + 2)
         total = torch.zeros_like(step)
-        for place, weight in NODES[14]:  # quadrature in log(x+2)
+        for place, weight in NODES[14]:
             part = polynomial("ratio_slope", v * torch.exp(-place * step))
             total += weight * part * torch.expm1((1 - place) * step)
         rise = log / 2 - polynomial("log_peak", 2 / (second + 2)) + polynomial("log_peak", v)
@@ -244,8 +243,7 @@ class _RatioRise(Function):
     @staticmethod
     def forward(ctx: Any, first: Tensor, second: Tensor) -> Tensor:
         ctx.save_for_backward(first, second)
-        log, near = _log_quotient(first, second)
-        step = torch.where(near, log, 0)
+        _, near, step = _log_quotient(first, second)
         v = 2 / (first + 2)
         total = torch.zeros_like(step)
         for place, weight in NODES[14]:
