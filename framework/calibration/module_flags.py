@@ -1,4 +1,4 @@
-"""A temporary value of a flag on selected modules, such as dropout that is active in evaluation."""
+"""Temporary modes of modules: evaluation of a model, or a flag on selected modules, such as active dropout."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +10,17 @@ BATCH_NORM = (
     *(nn.LazyBatchNorm1d, nn.LazyBatchNorm2d, nn.LazyBatchNorm3d),
 )
 """All batch-norm classes of torch."""
+
+
+@contextmanager
+def evaluation_mode(model: nn.Module) -> Iterator[None]:
+    """Set a model to evaluation inside the `with` block; after it, also after an error, to the mode that it had."""
+    training = model.training
+    try:
+        model.eval()
+        yield
+    finally:
+        model.train(training)
 
 
 @contextmanager

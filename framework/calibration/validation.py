@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution
 
+from framework.calibration.module_flags import evaluation_mode
 from framework.data import Batch
 from framework.errors import UserError
 from framework.model import Predictor
@@ -42,16 +43,12 @@ def predict_densities(model: Predictor, batches: Sequence[Batch]) -> list[Distri
     Samples on which a wrapper has trained its models itself (`SelfTraining`) are predicted by models that did not see
     them.
     """
-    training = model.training
     densities = []
-    try:
-        model.eval()
+    with evaluation_mode(model):
         for batch in batches:
             with held_out(model, batch):
                 densities.append(model(batch["input"]))
-        return densities
-    finally:
-        model.train(training)
+    return densities
 
 
 def require_numbers(values: Float[Tensor, "sample"], batches: Sequence[Batch], quantity: str) -> None:

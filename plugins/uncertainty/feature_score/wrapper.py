@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from framework.calibration.final_layer import find_final_layer, run_final_layer
+from framework.calibration.module_flags import evaluation_mode
 from framework.calibration.validation import nonempty_batches
 from framework.data import Batch
 from framework.distributions.class_probabilities import class_probabilities
@@ -181,16 +182,11 @@ class FeatureScore(Uncertainty, ReadsTraining):
         """Calibrate the wrapped model, and compute the statistics of the training split."""
         kept_batches = nonempty_batches(batches, by="feature_score")
         self.model.calibrate(kept_batches)
-        training = self.training
-        self.eval()
-        try:
+        with evaluation_mode(self):
             if self.method == "energy":
                 require_logits(self.model, kept_batches[0]["input"])
-                return
-            samples = kept_batches if self.training_split is None else self.training_split
-            self._fit(samples)
-        finally:
-            self.train(training)
+            else:
+                self._fit(kept_batches if self.training_split is None else self.training_split)
 
     def _fit(self, batches: Iterable[Batch]) -> None:
         def parts(*, one_class: bool = False) -> Iterator[tuple[Tensor, Tensor]]:

@@ -12,6 +12,7 @@ from torch.distributions import Distribution
 
 from framework.calibration.equal_mixture import equal_mixture
 from framework.calibration.final_layer import find_final_layer, run_final_layer
+from framework.calibration.module_flags import evaluation_mode
 from framework.calibration.validation import nonempty_batches, require_numbers
 from framework.calibration.weight_draws import weight_noise
 from framework.data import Batch
@@ -128,14 +129,10 @@ class Laplace(Uncertainty, ReadsTraining):
         """Calibrate the wrapped model; fit the posterior to the training split, and λ as `prior_precision` says."""
         kept_batches = nonempty_batches(batches, by="laplace")
         self.model.calibrate(kept_batches)
-        training = self.training
-        self.eval()
-        try:
+        with evaluation_mode(self):
             self._fit(kept_batches if self.training_split is None else self.training_split)
             if self.prior_precision == "validation":
                 self._choose_precision(kept_batches)
-        finally:
-            self.train(training)
         spread = (
             f"{self.precision.item():.3g}" if self.precision.isfinite() else "infinite (no spread is best)"
         )
