@@ -9,6 +9,7 @@ from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError
 from framework.metric import Metric
 from framework.target import Target
+from framework.testing.finding import failures
 from framework.testing.metrics import Cardioid, examine_metric, simplest_density
 from framework.testing.rows import MetricRow
 
@@ -52,7 +53,7 @@ class Contrast(Metric):
 
 def failed(fault, target):
     row = MetricRow("", target)
-    return {finding.name for finding in examine_metric(row, lambda: Contrast(fault)) if not finding.holds}
+    return set(failures(examine_metric(row, lambda: Contrast(fault))))
 
 
 @pytest.mark.parametrize("target", [CLASSES, ANGLE, REALS], ids=lambda target: target.kind)
@@ -69,7 +70,7 @@ def test_outliers_taken_for_test_samples_are_found():
             prediction.split = "test" if prediction.split == "outliers" else "outliers"
             super().update(prediction)
 
-    found = {finding.name for finding in examine_metric(MetricRow("", ANGLE), Swapped) if not finding.holds}
+    found = set(failures(examine_metric(MetricRow("", ANGLE), Swapped)))
     assert found == {"perfect beats random"}
 
 

@@ -13,6 +13,7 @@ from framework.metric import Metric
 from framework.prediction import Prediction
 from framework.target import Target
 from framework.testing.balls import CHANNELS, Ball, ball
+from framework.testing.finding import failures
 from framework.testing.metrics import examine_metric, simplest_density
 from framework.testing.plain import LENGTH, Plain
 from framework.testing.rows import MetricRow
@@ -116,7 +117,7 @@ def test_the_contract_finds_metrics_that_name_other_images_than_they_read() -> N
     row = MetricRow("", PLACE, size=SIZE)
     for told in (CHANNELS, {"color"}, {"depth"}, {"color", "depth"}):
         metric = Reads("color", "mask", told=frozenset(told))
-        failed = [finding.name for finding in examine_metric(row, metric.clone) if not finding.holds]  # type: ignore[arg-type]
+        failed = failures(examine_metric(row, metric.clone))  # type: ignore[arg-type]
         assert failed == ["only the images in reads are drawn"], told
     for metric in (
         Reads("color", "mask"),

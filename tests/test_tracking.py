@@ -280,15 +280,15 @@ def test_long_parameters_are_shortened_visibly_and_kept_whole(folder: Path) -> N
     assert json.loads(stored.read_text()) == {"long": long, "longer": longer}
 
 
+def on_a_full_disk(path: Path, content: bytes) -> None:
+    raise OSError(28, "No space left on device")
+
+
 def test_long_parameters_on_a_full_disk_stop_nobody(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     tracker = open_tracker(folder)
-
-    def full(path: Path, content: bytes) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(tracking, "write_whole", full)
+    monkeypatch.setattr(tracking, "write_whole", on_a_full_disk)
     tracker.log_params({"long": "y" * 251})
     tracker.close("FINISHED")
     assert client(folder).get_run(identity(folder)).data.params == {"long": "y" * 249 + "…"}
@@ -956,6 +956,14 @@ def test_a_killed_run_whose_store_is_away_is_closed_later(
     assert status(killed) == "FAILED"
 
 
+def resume(folder: Path, after: int, until: int) -> None:
+    """Resume the run of a folder from the checkpoint of step `after`, and end it before step `until`."""
+    tracker = open_tracker(folder, run_id=identity(folder))
+    tracker.drop_after(after)
+    log(tracker, range(after + 1, until))
+    tracker.close("FINISHED")
+
+
 @pytest.mark.parametrize("checkpoint", [0, 99, 120, 149, 155, 159])
 def test_a_killed_run_is_resumed_and_each_step_is_stored_once(killed: Path, checkpoint: int) -> None:
     tracker = open_tracker(killed, run_id=identity(killed))
@@ -976,10 +984,7 @@ def test_a_run_resumed_before_it_is_opened_and_resumed_again(killed: Path) -> No
     log(first, range(51, 101))
     first.leave_open()
     assert status(killed) == "RUNNING"
-    second = open_tracker(killed, run_id=identity(killed))
-    second.drop_after(80)
-    log(second, range(81, 180))
-    second.close("FINISHED")
+    resume(killed, after=80, until=180)
     assert history(killed) == losses(range(180))
 
 
@@ -999,10 +1004,7 @@ def test_what_a_power_cut_took_from_the_journal_is_not_missed(folder: Path) -> N
     tracker.leave_open()
     path = tracker.journal.path
     path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:20]))
-    again = open_tracker(folder, run_id=tracker.run_id)
-    again.drop_after(10)
-    log(again, range(11, 60))
-    again.close("FINISHED")
+    resume(folder, after=10, until=60)
     assert history(folder) == losses(range(60))
 
 
@@ -1324,11 +1326,7 @@ def test_run_json_that_cannot_be_written_stops_nobody(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     tracker = open_tracker(folder)
-
-    def full(path: Path, content: bytes) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("framework.tracking.run_info.write_whole", full)
+    monkeypatch.setattr("framework.tracking.run_info.write_whole", on_a_full_disk)
     log(tracker, range(5))
     tracker.close("FINISHED")
     assert history(folder) == losses(range(5))

@@ -3,7 +3,7 @@
 import math
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -175,6 +175,11 @@ def run_check(name: str, limit: float, check: Callable[[Worst], None], *, second
         message = " ".join(f"{type(error).__name__}: {error}".split())
         return Finding(name, message if len(message) <= 300 else message[:297] + "...", torch.inf, limit)
     return worst.finding(name, limit)
+
+
+def failures(findings: Iterable[Finding]) -> list[str]:
+    """Return the names of the findings that do not hold."""
+    return [finding.name for finding in findings if not finding.holds]
 
 
 def require(*findings: Finding) -> None:
