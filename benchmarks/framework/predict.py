@@ -97,10 +97,10 @@ def seconds(folder: Path, line: Sequence[str], code: Path = ROOT) -> tuple[float
     environment = {**os.environ, "PYTHONPATH": str(code), "OMP_NUM_THREADS": "1"}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    done = subprocess.run(line, cwd=folder, env=environment, capture_output=True, text=True)
+    process = subprocess.run(line, cwd=folder, env=environment, capture_output=True, text=True)
     wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
-    if done.returncode:
-        raise SystemExit(f"{' '.join(line)} failed:\n{done.stdout}{done.stderr}")
+    if process.returncode:
+        raise SystemExit(f"{' '.join(line)} failed:\n{process.stdout}{process.stderr}")
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, wall
 
 

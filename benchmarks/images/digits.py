@@ -262,10 +262,10 @@ def draw_densities(file: Path) -> None:
 
 def page() -> None:
     """Write the page and its figures from the runs."""
-    here = Path(__file__).resolve().parent
+    page_folder = Path(__file__).resolve().parent
     rows = corruption_rows()
-    draw_corruptions(rows, here / "digits_corrupted.png")
-    draw_densities(here / "digits_turned.png")
+    draw_corruptions(rows, page_folder / "digits_corrupted.png")
+    draw_densities(page_folder / "digits_turned.png")
     likelihoods, gain = likelihood_table()
     readings, both = reading_table()
     classes = json.loads((_folder("classes") / "results.json").read_text(encoding="utf-8"))
