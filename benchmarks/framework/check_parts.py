@@ -196,7 +196,7 @@ The column `fault` names the change, and `failed properties` lists every propert
 
 ## False alarms
 
-`mode=check` gave {len(alarms)} false alarms, which are failed tests of correct plugins. It tested {rows}
+Number of false alarms of `mode=check`, which are failed tests of correct plugins: {len(alarms)}. It tested {rows}
 constructions of the plugins of this project and {external} correct {"plugin" if external == 1 else "plugins"} that
 {"is" if external == 1 else "are"} not part of it, with {seeds} random seeds each.
 
