@@ -92,10 +92,10 @@ normal density. A row with **missed** is a planted fault that `mode=check` did n
 ## False alarms
 
 Number of false alarms of `mode=check`, which are failed tests of correct density heads:
-{sum(map(len, failed.values()))}. It tested {rows} configurations of the density heads of this project with {seeds} random
-seeds each. It also tested {right_rows} configurations of correct density heads that are not part of this project (tests/right_heads.py). Each
-line of the following list names the random seeds, the density head, its configuration and the property whose test
-failed:
+{sum(map(len, failed.values()))}. It tested {rows} configurations of the density heads of this project with {seeds}
+random seeds each. It also tested {right_rows} configurations of correct density heads that are not part of this project
+(tests/right_heads.py). Each line of the following list names the random seeds, the density head, its configuration and
+the property whose test failed:
 {chr(10).join(alarm_lines)}
 
 {machine("torch", "numpy")} Command: `python -m benchmarks.framework.check`. Run time: {minutes:.0f} minutes.
