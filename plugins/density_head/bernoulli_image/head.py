@@ -17,8 +17,8 @@ from plugins.density_head.bernoulli_image.density import BernoulliImage
 SMALLEST = 1e-3
 """Smallest probability; the largest is 1 - SMALLEST.
 
-A wrong number therefore costs at most 7 nats before calibration. A step of an 8-bit image is 4e-3, so that smaller
-probabilities carry no information about an image.
+The log-probability of a number is therefore at least log SMALLEST, about -7 nats, before calibration. A step of an
+8-bit image is 4e-3, so that smaller probabilities carry no information about an image.
 """
 LEAST, MOST, ROUNDS = 1e-2, 1e2, 60
 """Bounds of the factor by which calibration multiplies the log-odds, and number of bisections that find this factor."""

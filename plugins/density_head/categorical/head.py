@@ -53,7 +53,10 @@ class BernoulliHead(DensityHead):
         return classes(torch.cat([torch.zeros_like(raw), raw], -1))
 
     def loss(self, raw: Float[Tensor, "*batch 1"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return the negative log-likelihood of each sample, nats, without building the density, which takes longer."""
+        """Return the negative log-likelihood of each sample, nats.
+
+        It is computed from the logits, which takes less time than building the density.
+        """
         raw = require_finite(raw, self.size).squeeze(-1)
         return binary_cross_entropy_with_logits(raw, target.to(raw.dtype), reduction="none")
 

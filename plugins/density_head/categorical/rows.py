@@ -26,7 +26,7 @@ def exact(logits: list[float], label: int) -> float:
 
 
 def softmax_cases(head: DensityHead) -> Iterator[Case]:
-    """Yield cases with one value for the first logit and one value, often another one, for all other logits."""
+    """Yield cases in which the first logit has one value, and all other logits share a second value."""
     for first, second in LOGITS:
         raw = torch.tensor([first] + [second] * (head.size - 1), dtype=torch.float32).double()
         value = torch.arange(head.size)

@@ -41,7 +41,7 @@ from plugins.density_head.flights.reference_frame import require_frame
 WINDOWS = 32
 """Largest number of training samples (windows of flights) from which `fit` identifies the constants."""
 LEAST_NOISE, MOST_NOISE = 1e-4, 1.0
-"""Bounds of the noise, metres."""
+"""Bounds of the standard deviation of the noise of a coordinate, metres."""
 SPREAD = (0.1, 1e3)
 """Smallest and largest factor on a standard deviation that `calibrate` fits."""
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -205,7 +205,7 @@ class BallisticHead(DensityHead, Fitted):
     def _carried(self, observations: ObservedFrames, estimate: Estimate) -> tuple[Tensor, Tensor]:
         """Return the mean of the future positions and a factor F of their covariance F Fᵀ.
 
-            The mean has the shape (flight, coordinate), with three coordinates for each frame. F has the shape
+        The mean has the shape (flight, coordinate), with three coordinates for each frame. F has the shape
         (flight, coordinate, 9) and comes from the linearised flight.
         """
         places, slopes = simulate_with_jacobian(estimate.state, self._whole(observations), self.constants)

@@ -14,15 +14,18 @@ from framework.flights.trajectories import simulate, simulate_with_jacobian
 FITTED = ("drag", "lift", "restitution", "friction", "surface")
 """Names of the constants that `identify` fits."""
 LOW, HIGH = (0.0, -0.02, 0.3, 0.0, -0.3), (1.0, 0.02, 1.0, 1.0, 0.3)
-"""Bounds of the constants in `FITTED`; the bounds of the surface are metres above its value at the start."""
+"""Bounds of the constants in `FITTED`.
+
+The bounds of "surface", the height of the table, are metres above its value at the start of the search.
+"""
 UNITS = (" 1/m", "", "", "", " m")
 """Unit of each constant in `FITTED`, as messages state it."""
 HIGHEST = 20.0
-"""Largest height of the table, m above or below its value in the config, of a stored head."""
+"""Largest accepted difference, m, between the height of the table in a stored head and in the config."""
 SIZES = (0.05, 0.002, 0.05, 0.05, 0.01)
-"""Typical step size of each constant."""
+"""Typical step size of each constant in `FITTED`, in its unit."""
 ROUNDS = 40
-"""Largest number of steps."""
+"""Largest number of steps of the search."""
 ENOUGH = 3e-4
 """Share of the cost: the search ends after two successive steps that lower the cost by less than this share.
 

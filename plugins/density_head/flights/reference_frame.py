@@ -15,15 +15,19 @@ FEWEST = 5
 PIECE = 12
 """Number of frames of a piece of a flight."""
 FALL = (5.0, 20.0)
-"""Accelerations, m/s², that can be those of a falling ball; others are of noise, or of another unit."""
+"""Range of the acceleration of a falling ball, m/s²; a value outside it comes from noise or from another unit."""
 STEEP = 0.85
 """Smallest cosine of the angle between the acceleration and the downward axis; drag alone gives about 0.95."""
 TURN = 0.3
 """Smallest vertical speed, m/s, before and after a bounce."""
 NEAR_HEIGHT = 0.05
-"""Distance, m, up to which bounces are of the same height, and up to which `identify` needs no better start."""
+"""Difference of two heights, m, up to which they count as equal.
+
+Bounces with a larger median deviation from their median height say nothing about the table. If their median height is
+equal to that of the config, `identify` starts from the height in the config.
+"""
 OUTSIDE = 0.2
-"""Share of bounces beyond the ends of the table that may be errors."""
+"""Largest share of bounces beyond the ends of the table that is accepted as errors of the observations."""
 
 
 def accelerations(observations: ObservedFrames) -> Float[Tensor, "piece 3"]:
@@ -44,10 +48,11 @@ def accelerations(observations: ObservedFrames) -> Float[Tensor, "piece 3"]:
 
 
 def bounces(observations: ObservedFrames) -> Float[Tensor, "bounce 3"]:
-    """Return the positions of the ball's centre at its bounces, m, between two frames each.
+    """Return the positions of the ball's centre at its bounces, m.
 
-    A bounce is where the ball falls before, and rises after. Its height is where the lines through the two frames
-    before and through the two frames after meet.
+    A bounce lies between two frames: the ball falls before the first of them, and rises after the second. One line goes
+    through the two frames before the bounce, and another line through the two frames after it. The height of the bounce
+    is that of the point where these lines meet.
     """
     times, places = observations.times, observations.places
     gaps = times.diff(dim=1).clamp(min=1e-6)

@@ -20,7 +20,10 @@ BINS = 360
 FEW = 4608
 """Largest number of cells for which a matrix holds the share of each cell in each arc."""
 POINTS = 2**20
-"""Least number of points in all cells from which the density of a single angle is computed; at least 64 in each."""
+"""Number of points in all cells together from which the density of a single angle is computed.
+
+Each cell has the same number of points, and at least 64.
+"""
 
 
 class CellDensity(ViewpointDensity):
@@ -79,8 +82,8 @@ class CellDensity(ViewpointDensity):
 class AngleDensity(PlainDensity):
     """The density of one angle of a `CellDensity`, constant in BINS arcs.
 
-    The probability of an arc is computed from many points of each cell, so that it is an approximation, exact in the
-    limit of many points. It sums to 1.
+    The probability of an arc is estimated from many points of each cell; the error vanishes in the limit of many
+    points. The probabilities of all arcs sum to 1.
 
     Args:
         log_density: log-density in each arc, (*batch, arc), nats.

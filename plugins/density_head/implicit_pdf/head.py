@@ -23,7 +23,7 @@ Cells = Literal[72, 576, 4608, 36864, 294912]
 LARGEST_FEATURE = 30.0
 """Bound of the features that the network reads, so that it stays accurate for raw parameters of any size."""
 CHUNK = 2**22
-"""Largest number of numbers in a hidden layer that are computed at once."""
+"""Largest number of activations of a hidden layer that are computed at once."""
 
 
 class ImplicitPDFHead(DensityHead):

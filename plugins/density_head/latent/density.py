@@ -142,6 +142,10 @@ class LatentDensity(PlainDensity):
     rises towards it with their number. With a tolerance, the number of values of z is doubled for each φ until the
     estimated error is below the tolerance. `sample` draws a new z for every value. `entropy`, `mode`, `median` and
     `marginal` are computed from `mixture`.
+
+    Args:
+        latent: networks of the head, applied to a batch of inputs x.
+        effort: number of values of z, and the tolerance.
     """
 
     def __init__(self, latent: Latent, effort: Effort) -> None:

@@ -238,7 +238,10 @@ def _(density: PiecewiseQuantiles) -> Tensor:
 
 @protocol.ranked_score.register
 def _(density: PiecewiseQuantiles, value: Tensor) -> Tensor:
-    """Return the score as the integral of (F(x) - [x ≥ y])² over x, which is a sum of integrals over the pieces."""
+    """Return the continuous ranked probability score, the integral of (F(x) - [x ≥ y])² over x.
+
+    It is a sum of integrals over the pieces of the density.
+    """
     quantiles, probabilities = density.offsets.double(), density.probabilities.double()
     number = value.double() - density.location.double()
     left, right = quantiles[..., :-1], quantiles[..., 1:]

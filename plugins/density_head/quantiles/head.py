@@ -22,7 +22,7 @@ LARGEST = 1e8
 LARGEST_STEP = 1e3
 """Bound of the distance of two neighbouring quantiles, so that the sum of all keeps the digits of the smallest."""
 FURTHEST = 1e9
-"""Bound of the corrections that `calibrate` sets, in distances of the outermost quantiles."""
+"""Bound of the corrections that `calibrate` sets, in units of the distance between the outermost quantiles."""
 
 
 class QuantilesHead(DensityHead):
@@ -32,9 +32,9 @@ class QuantilesHead(DensityHead):
     it approaches the continuous ranked probability score (Gneiting & Raftery 2007). The quantiles cannot cross: the raw
     parameters are the middle quantile and the distances to the next ones. `calibrate` moves each quantile, so
     that at least the stated share of the validation split lies below it (conformalised quantile regression, Romano,
-    Patterson & Candès 2019, for each quantile). The step of a quantile, divided by the distance from the lowest to the
-    highest quantile, is the same for all samples. The moved quantiles are sorted (Chernozhukov, Fernández-Val &
-    Galichon 2010).
+    Patterson & Candès 2019, for each quantile). It moves a quantile by the same share of the distance from the lowest
+    to the highest quantile for all samples. The moved quantiles are sorted (Chernozhukov, Fernández-Val & Galichon
+    2010).
 
     Args:
         levels: number of quantiles K, odd; their probabilities are k/(K + 1).
@@ -92,7 +92,10 @@ class QuantilesHead(DensityHead):
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Set corrections, such that the share of the samples below each quantile is its probability, rounded up."""
+        """Set the corrections of all quantiles.
+
+        Of n samples, at least min(n, ⌈(n + 1) τ⌉) lie at or below the moved quantile of the probability τ.
+        """
         require_validation(raw, "The quantiles are")
         quantiles = PiecewiseQuantiles(*self._parts(raw.double()), self.levels, self.tail).quantiles
         value = self.unit.standardise(target).double()

@@ -63,7 +63,10 @@ def _(density: RotationLaplace) -> UniformViewpoints:
 
 @marginal.register
 def _(density: RotationLaplace, index: int) -> Angle:
-    """Return the density of one angle of the mixture over s, whose components have the falls sλ (`functions`)."""
+    """Return the marginal density of one angle.
+
+    The density of rotations is a mixture over s, whose components have the falls s·λ (`functions`).
+    """
     frame = density.frame
     scale, log_mass = functions.log_node_weights(frame.falls)
     components = aligned_rotations.Frame(

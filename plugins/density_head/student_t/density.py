@@ -21,11 +21,14 @@ from plugins.density_head.student_t.functions import (
 )
 
 FEW = 64
-"""Number of elements below which SciPy computes distribution functions; for more, a sum takes a tenth of its time."""
+"""Number of elements below which SciPy computes distribution functions.
+
+For more elements, and whole degrees of freedom, a sum of terms takes a tenth of SciPy's time.
+"""
 MOST_TERMS = 40
 """Largest whole degrees of freedom for which the distribution function is computed as a sum."""
 RARE = 1e-6
-"""Probability of a tail below which SciPy computes it."""
+"""Probability below which SciPy computes a tail, since the sum of terms has lost its digits there."""
 NORMAL = 1e8
 """Degrees of freedom that stand for a normal density: the log-densities differ by less than 1e-7 within 2 scales."""
 
@@ -161,7 +164,7 @@ def _(density: StudentT, value: Tensor) -> Tensor:
 
 @protocol.ranked_score.register
 def _(density: StudentT, value: Tensor) -> Tensor:
-    """Return the score of Student's t by its formula (Jordan, Krüger & Lerch 2019, appendix A.2)."""
+    """Return the continuous ranked probability score by its formula (Jordan, Krüger & Lerch 2019, appendix A.2)."""
     freedom, scale = density.freedom.double(), density.scale.double()
     away = (value.double() - density.location.double()) / scale
     ratio = away / freedom.sqrt()

@@ -29,8 +29,9 @@ class EvidentialHead(HeadOfReals):
     reduces the evidence for predictions that are wrong (eq. 9-10). The aleatoric variance is β / (α - 1), and the
     epistemic one β / (ν (α - 1)) (`evidence`).
 
-    Raw parameters r: γ itself; ν, α - 1 and √β are the positive function of r that other heads use for scales. If
-    `Target` has the mean and the standard deviations of the training targets, raw parameters are relative to them.
+    For each number, the head reads four raw parameters. The first is γ itself. ν, α - 1 and √β are the positive
+    function `scale_of_raw` of the other three. If `Target` has the mean and the standard deviations of the training
+    targets, raw parameters are relative to them.
 
     Args:
         evidence_weight: λ. The likelihood depends on ν and β only through one number, so that the penalty alone

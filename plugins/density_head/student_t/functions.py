@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 SERIES = 25.0
-"""Argument from which on the differences are computed by their asymptotic series, which is then exact to 1e-15."""
+"""Argument above which `log_gamma_step` and `digamma_step` use asymptotic series, which are exact to 1e-15 there."""
 FAR = 1e4
 """Ratio |z|/√ν above which log(1 + z²/ν) is computed without its square, which may overflow."""
 

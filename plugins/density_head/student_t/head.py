@@ -41,8 +41,8 @@ class StudentTHead(HeadOfReals):
     unit and in double precision.
 
     Args:
-        degrees_of_freedom: "calibrated": one for each number of the target, chosen by `calibrate`; "predicted": for
-            each input and number; or a number for all.
+        degrees_of_freedom: "calibrated": `calibrate` chooses one value for each number of the target. "predicted": the
+            network predicts a value for each input and each number. A number above 2: this value is used everywhere.
         balance: β of Seitzer et al. 2022: the gradient of each number, not the loss, is multiplied by its scale to the
             power 2β. With 0 (the likelihood alone) a location is learned more slowly the wider its scale is. With 1 all
             locations are learned as with squared error.

@@ -36,11 +36,12 @@ ROUNDS = 200
 class ExtraTreesHead(DensityHead, Fitted):
     """A forest of trees with random thresholds, fitted to all training samples at once (Geurts et al. 2006).
 
-    Classes: p_k = (T f_k + a) / (T + a K) for K classes and T trees, where f_k is the share of class k in a sample's
-    leaf, averaged over the trees, and a is `smoothing`. This is Laplace's rule on T votes: no class has probability 0,
-    and the classes keep the order of f_k. Reals: a mixture with one normal density around the mean of each
-    tree, with one width for each number of the target. After the fit the width is the standard deviation of the
-    training targets; `calibrate` fits it to the validation split by maximum likelihood. The output of the trees is
+    For K classes and T trees, p_k = (T f_k + a) / (T + a K), where f_k is the share of class k in a sample's leaf,
+    averaged over the trees, and a is `smoothing`. This is Laplace's rule on T votes: no class has probability 0, and
+    the classes keep the order of f_k. For reals, the density is a mixture of one normal density for each tree. The mean
+    of a tree's density is the mean of the training targets in the sample's leaf. All these densities have one common
+    standard deviation, the width, for each number of the target. After the fit the width is the standard deviation of
+    the training targets; `calibrate` fits it to the validation split by maximum likelihood. The output of the trees is
     piecewise constant in the features, and its gradient is 0.
 
     The forest is stored as flat arrays of integers and thresholds; scikit-learn grows it and is not needed to use it.

@@ -35,11 +35,11 @@ Share = Annotated[float, Field(gt=0, le=1)]
 class XGBoostHead(DensityHead, Fitted):
     """Trees that each correct the sum of the previous ones, fitted to all training samples at once.
 
-    Classes: the softmax of the sums of the trees, one sum for each class, trained by cross-entropy. Reals: a normal
-    density around the sum of the trees, trained by squared error. It has one standard deviation for each number of the
-    target: the root mean squared residual on the training set after the fit, and on the validation set after
-    `calibrate`. The output of the trees is piecewise constant in the features, and its gradient is 0. Predictions are
-    float32.
+    For classes, each class has its own sum of trees; the probabilities are the softmax of these sums, trained by
+    cross-entropy. For reals, the density is normal, and its mean is the sum of the trees, trained by squared error. It
+    has one standard deviation for each number of the target: the root mean squared residual on the training split after
+    the fit, and on the validation split after `calibrate`. The output of the trees is piecewise constant in the
+    features, and its gradient is 0. Predictions are float32.
 
     The model is stored as bytes in the library's own portable binary format (UBJSON), which contains no code.
 

@@ -1,6 +1,6 @@
 """A strict parser, with bounded memory, of the UBJSON that xgboost writes.
 
-A library cannot replace it: xgboost cannot check a model, and its loader aborts the process for an empty one (3.2).
+The parser is needed because xgboost 3.2 cannot check a model, and its loader aborts the process for an empty model.
 """
 
 import struct

@@ -198,10 +198,11 @@ class _Cdf(Function):
 
 
 def _log_quotient(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return log((κ₂+2)/(κ₁+2)) for κ₁ in `first` and κ₂ in `second`, whether its magnitude is at most 1, and a step.
+    """Return the logarithm log((κ₂+2)/(κ₁+2)), a mask, and a step, for κ₁ in `first` and κ₂ in `second`.
 
-    If it is, integrals from κ₁ to κ₂ are computed by quadrature in log(x+2), because a difference of antiderivatives
-    would lose digits. The step of the quadrature is this logarithm, and 0 elsewhere.
+    The mask is true where the magnitude of the logarithm is at most 1. There, integrals from κ₁ to κ₂ are computed by
+    quadrature in log(x+2), because a difference of antiderivatives would lose digits. The step of the quadrature is the
+    logarithm where the mask is true, and 0 elsewhere.
     """
     quotient = torch.log((second + 2) / (first + 2))
     near = quotient.abs() <= 1

@@ -9,9 +9,15 @@ from torch import Tensor
 NEGLIGIBLE = 1e-17
 """Moments of an absolute value below this one are taken as 0."""
 AHEAD = 256
-"""Number of orders above the highest moment at which the recurrence starts, in which an error of its start dies out."""
+"""Number of orders by which the start of the recurrence lies above the highest moment.
+
+The error of the value at the start dies out over these orders.
+"""
 FEW = 2**18
-"""Number of moments of single densities up to which they are computed in few calls of torch."""
+"""Number of moments, summed over all densities, up to which a few calls of torch compute all orders together.
+
+More moments are computed order by order, which needs less memory.
+"""
 AT_ONCE = 2**21
 """Largest number of moments of single densities that are kept in memory at once (16 MiB)."""
 

@@ -7,8 +7,7 @@ from torch import Tensor
 FEWEST = 4096
 """Smallest number of elements that are computed by compiled code if gradients are needed, as in each training step."""
 FEWEST_ONCE = 2**18
-"""Smallest number of elements that are computed by compiled code without gradients, and of samples.
-
+"""Smallest number of elements, or of samples to draw, for which compiled code is used if no gradient is needed.
 The import of numba takes half a second, which few evaluations of fewer elements would not make up for.
 """
 
@@ -38,8 +37,8 @@ def applies(*arguments: Tensor) -> bool:
 def empty(count: int, shape: torch.Size, dtype: torch.dtype) -> list[Tensor]:
     """Return `count` tensors without contents.
 
-    They share one piece of memory from NumPy, which asks the system for large pages. With torch's ordinary pages, the
-    system would take as long as the computation for a million elements.
+    They share one piece of memory from NumPy, which asks the system for large pages. For a million elements, providing
+    ordinary pages, as torch requests them, would take the system as long as the computation itself.
     """
     parts = np.empty((count, shape.numel()), dtype=str(dtype).removeprefix("torch."))
     return [torch.from_numpy(part).view(shape) for part in parts]
