@@ -13,7 +13,7 @@ from framework.errors import ConfigError, DataError, did_you_mean
 SLACK = 1e-3
 """Largest accepted difference between 1 and the sum of a vertex's skinning weights."""
 ROUNDING = 1e-6
-"""Difference between 1 and a vertex's sum of weights from which on the weights are divided by this sum."""
+"""Largest difference between 1 and the sum of a vertex's weights at which no weights are divided by their sum."""
 
 
 @dataclass(frozen=True)

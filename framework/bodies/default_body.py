@@ -33,16 +33,17 @@ VERSION = 3
 class Traits:
     """Mapping from named traits of a person to shape coefficients.
 
-    A trait is interpolated linearly between anchors (newborn, baby, child, ... of age). Every blend shape is weighted
-    by the product of the anchors that it represents (MakeHuman's "macro" targets), and the products are projected onto
-    the body's shape coefficients.
+    An anchor is a value of a trait with a name (of age: newborn, baby, child, ...). The two anchors around a person's
+    value get the weights of linear interpolation between them. A blend shape represents one or several anchors of
+    different traits (MakeHuman's "macro" targets), and its weight is the product of the weights of these anchors. A
+    matrix maps the weights of all blend shapes to the body's shape coefficients.
 
     Attributes:
         labels: names of the traits that may be given, each 0…1: "gender" is 0 for male and 1 for female, "age" is 0 for
             a baby, 1/3 for a child, 2/3 for a young adult and 1 for old.
         anchors: anchors of each interpolated trait, ascending.
-        traits: trait to which each column of `products` belongs. A trait with n columns but without anchors has the
-            factor 1/n in each column.
+        traits: trait to which each column of `products` belongs; a column stands for one anchor. A trait with n columns
+            but without anchors has the weight 1/n in each column.
         products: (blend shape, column), true if the column is a factor of the blend shape's weight.
         projection: matrix from blend shapes to shape coefficients.
         largest_error: largest distance, metres, between a vertex of a random body and the same vertex as `anny`

@@ -142,7 +142,7 @@ class ParametricBody:
     def camera(self, height: int, width: int) -> Camera:
         """Return a camera in front of the body, which sees the whole body if all parameters of the body are 0.
 
-        The distance of the camera is 1.2 times the height of the body.
+        The image has `height` × `width` pixels. The distance of the camera is 1.2 times the height of the body.
         """
         low, high = float(self.template[1].min()), float(self.template[1].max())
         return Camera(

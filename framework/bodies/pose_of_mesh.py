@@ -19,11 +19,14 @@ BENT = 0.7
 """Prior standard deviation, radians, of every joint except the root; the prior spreads a bend over several joints."""
 STEPS = 60
 ENOUGH = 1e-6
-"""Step, metres and radians, below which the search ends."""
+"""Size of a step below which the search ends: radians, metres or standard deviations, as for `STEP`."""
 MOST = 2_500
-"""Largest number of vertices that are used; of a mesh with more, every n-th vertex is used."""
+"""Largest number of vertices that a fit uses; if a mesh has more vertices, the fit uses every n-th of them."""
 STEP = 1e-5
-"""Step of the central differences by which the model is differentiated: radians, metres, standard deviations."""
+"""Step of the central differences by which the model is differentiated.
+
+The unit is radians for joint rotations, metres for the translation, and standard deviations for shape coefficients.
+"""
 TOGETHER = 24
 """Number of parameters by which the model is differentiated at once."""
 
@@ -76,11 +79,15 @@ class _Problem(NamedTuple):
 
 @torch.no_grad()
 def fit_mesh(body: Body, vertices: Float[Tensor, "vertex 3"], usual: float = 1.0) -> MeshFit:
-    """Return the most probable pose, shape and translation of a mesh, metres (Levenberg-Marquardt; Moré 1978).
+    """Return the most probable pose, shape and translation of a body for a mesh (Levenberg-Marquardt; Moré 1978).
 
-    The search starts from the rotations of each joint's vertices, so that any pose can be found, even of a person
-    upside down. The shape coefficients of `body` have standard deviation 1. `usual` is the weight of the prior on pose
-    and shape; with 0 only the vertices count.
+    The search starts from the joint rotations of `estimate_rotations`, so that any pose can be found, even that of a
+    person who is upside down.
+
+    Args:
+        body: the body model; its shape coefficients have standard deviation 1 among people.
+        vertices: vertices of the mesh, metres, in the order of the body's vertices.
+        usual: weight of the prior on pose and shape; with 0 there is no prior, and only the vertices count.
 
     Raises:
         DataError: the mesh has another number of vertices, or numbers that are not finite.

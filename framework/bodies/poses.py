@@ -19,7 +19,10 @@ Degrees = float | int
 Range = tuple[Degrees, Degrees, Degrees, Degrees]
 """Mean, standard deviation, smallest and largest value of a movement."""
 Kinds = dict[str, tuple[float, dict[str, tuple[Degrees, Degrees]]]]
-"""Kinds of poses by name: share among random poses, and mean and deviation of movements that differ from `SIDED`."""
+"""Kinds of poses by name, each as a pair: its share among random poses, and the movements that characterise it.
+
+Each of these movements has a mean and a standard deviation, which replace those in `SIDED`.
+"""
 CENTRAL: dict[str, Range] = {
     "pitch": (0, 4, -15, 15),  # pitch, yaw, roll: the whole body about x, y and z
     "yaw": (0, 12, -40, 40),

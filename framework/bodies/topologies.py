@@ -150,7 +150,13 @@ def topology(body: Body, surface: Sheet, name: Name) -> Topology:
 def recognise_topology(
     body: Body, vertices: int, faces: Int[np.ndarray, "faces 3"], source: str
 ) -> tuple[Sheet, Topology]:
-    """Return the sheet and the topology of the body that fit a mesh: as many vertices, and the same triangles.
+    """Return the topology of the body that has the vertices and triangles of a mesh, and the sheet of this topology.
+
+    Args:
+        body: the body model.
+        vertices: number of vertices of the mesh.
+        faces: triangles of the mesh.
+        source: origin of the mesh, for messages.
 
     Raises:
         DataError: no topology of the body has this number of vertices, or the triangles differ.

@@ -38,7 +38,7 @@ MISSING = frozenset(
 BOOLEANS = {"true": 1.0, "false": 0.0}
 """Numbers as which the words TRUE and FALSE (in small letters) are read."""
 ENOUGH_ROWS = 20
-"""Number of rows that a table must exceed to be searched for columns of row numbers and of radians."""
+"""Largest number of rows of a table that is not searched for columns of row numbers or of angles in radians."""
 INDEX = re.compile(
     r"unnamed: \d+(_level_\d+)?|index|level_\d+|row|rows?[ _.]?(number|name|id|index)s?|rownum|id|idx", re.I
 )

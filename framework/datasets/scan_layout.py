@@ -8,7 +8,8 @@
     subjects/<name>/masks/<view>.png           8-bit grey: share of the pixel that the subject covers
     subjects/<name>/texture.png                optional
 
-Cameras follow OpenCV: pixel = K (R X + t), divided by depth; pixel centres at whole numbers, metres.
+Cameras follow OpenCV: a point X, in metres, is seen at the first two numbers of K (R X + t) divided by the third, which
+is its depth. The centres of pixels have whole numbers as coordinates.
 """
 
 import json

@@ -18,8 +18,8 @@ from framework.storage.reading import read_bytes
 TEXELS = 4
 """Largest number of texels along a side of a texture for each pixel of the image's longer side.
 
-Finer textures are averaged. For the default body some 6 × 6 texels then lie in a pixel, so that with `supersampling` 4
-the samples skip no texel.
+Finer textures are averaged. In images of the default body, some 6 × 6 texels then lie in a pixel. A renderer that takes
+4 × 4 samples per pixel, and interpolates between texels, therefore skips no texel.
 """
 CACHED = 16
 """Number of textures that stay in memory: together 67 MB for textures of 512 × 512 texels."""

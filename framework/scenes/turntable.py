@@ -23,7 +23,10 @@ from framework.storage.text import decode
 MARGIN = 1.03
 """Factor on the smallest distance from which the whole sphere around the subject is visible."""
 NEAR = 1e-3
-"""Distance of the near plane, metres; for a subject nearer than 1 m, this share of the distance to the subject."""
+"""Distance of the near plane from the camera, metres.
+
+If a subject is nearer than 1 m, the near plane is at NEAR times the subject's distance.
+"""
 LONGEST_SIDE = 2**14
 ROTATION_ERROR = 1e-4
 """Largest allowed difference between R Rᵀ and the identity; files hold rounded numbers."""
