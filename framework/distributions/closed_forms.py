@@ -224,7 +224,7 @@ def _(density: MultivariateNormal, value: Tensor) -> Tensor:
 def normal_quantile(probability: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Return z with Φ(z) = probability, where Φ is the distribution function of the standard normal density.
 
-    Probabilities that are 0 or 1, or closer to these than 2⁻⁵⁴ or 2⁻⁵³, give about -8.3 or 8.2, and not ±∞.
+    A probability below 2⁻⁵⁴ gives about -8.3 and not -∞; a probability above 1 - 2⁻⁵³ gives about 8.2 and not ∞.
     """
     probability = probability.clamp(2.0**-54, 1 - 2.0**-53)
     if torch.compiler.is_exporting():

@@ -31,7 +31,10 @@ circular_entropy = entropy_of_one
 CHUNK = 2**20
 """Largest number of component densities that are evaluated at once, if no gradient is needed."""
 LARGEST = 2**26
-"""Largest number of elements of the values at which component densities are evaluated at once; an image has 1e5."""
+"""Largest number of elements of all values at which component densities are evaluated at once.
+
+A value that is an image has about 1e5 elements.
+"""
 
 SHORT, MANY = 16, 4096
 """Largest number of components, and smallest number of weights, for which weights are normalised by simple operations.

@@ -30,7 +30,8 @@ class Exported:
         parts: constructor arguments that are densities themselves, or lists of densities.
         settings: constructor arguments that are the same for every input, as plain values.
         code: import path of a module that computes the family with NumPy alone.
-        remark: sentence for the user if log-densities differ from those of the original density, which is an estimate.
+        remark: sentence for the user if the original density is only estimated, so that its log-densities differ from
+            those of the exported density; "" otherwise.
     """
 
     family: str

@@ -30,7 +30,8 @@ from framework.errors import UserError
 DRAWS = 9999
 """Number of draws of a density whose distribution function is not known.
 
-The probability of an interval between two draws then has a standard error of 0.003, if it is 0.9.
+If an interval between two draws is to have the probability 0.9, its true probability then has a standard error of
+0.003.
 """
 ROUNDS = 200
 """Largest number of steps in which a bracket is narrowed; the search normally ends earlier, at a width of EXACT."""

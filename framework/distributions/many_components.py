@@ -20,15 +20,15 @@ FEWEST = 2048
 KEPT = 64
 """Number of candidates that are kept; the density at these is computed exactly afterwards."""
 NODES = 4
-"""Smallest number of nodes for each width of a component; the largest number is twice as large."""
+"""Smallest number of nodes over the width of a component; the largest number is twice as large."""
 REACH = 64
 """Number of nodes on each side of a component: at least 8 widths, where a normal density has fallen by a factor e³²."""
 BLOCK = 7
-"""Number of binary digits of a node's number within its block; memory is reserved for blocks of nodes."""
+"""Number of binary digits of a node's index within its block; memory is reserved for whole blocks of nodes."""
 COARSEST = 8
 """Level of 2⁸ nodes on a circle, on which wide components are computed at all nodes."""
 FINEST = 2.0**36
-"""Largest number of a node; beyond it, rounding of angles would move nodes against the components."""
+"""Largest index of a node; beyond it, rounding of angles would move nodes against the components."""
 AT_ONCE = 2**13
 """Number of components that are evaluated at once."""
 

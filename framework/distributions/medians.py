@@ -10,7 +10,10 @@ from framework.distributions import protocol
 ROUNDS = 100
 """Largest number of steps; Newton's method needs three to six, and bisection alone 60."""
 TOLERANCE = 1e-6
-"""Largest difference of F from ½ before the last step, after which it is about the square of this number."""
+"""Largest difference of the distribution function from ½ before the last step.
+
+After this step, the difference is about the square of this number.
+"""
 
 
 @torch.no_grad()

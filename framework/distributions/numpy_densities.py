@@ -22,7 +22,11 @@ Array = NDArray[Any]
 DRAWS = 4096
 """Number of draws of an estimated entropy, which is printed with its standard error, and of estimated medians."""
 MANY = 16
-"""Number of peaks above which neighbouring ones share panels of a quadrature, and only the highest are compared."""
+"""Number of peaks or components above which computations are simplified.
+
+If there are more peaks, neighbouring peaks share panels of a quadrature, and the search for the mode starts from the
+MANY highest peaks only. If there are more components, the distribution function is computed by quadrature.
+"""
 STEPS = 200
 """Largest number of steps of the search for a mode and of a bisection."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)

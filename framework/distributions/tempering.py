@@ -35,9 +35,9 @@ RESOLVED = 1e-4
 MASS_GAP = 0.01
 """Largest |log ∫ p| on a grid that resolves p; if it is larger, a peak lies between the grid's angles."""
 HELD = 0.3
-"""Integral of p at a single angle of the grid above which MASS_GAP does not apply.
+"""Probability that a single angle of the grid represents, above which MASS_GAP does not apply.
 
-The peak is then found, and the grid is too coarse for p itself, but not necessarily for its power.
+The angle then lies on the peak. The grid is too coarse for p itself, but not necessarily for its power.
 """
 NARROWEST = 3.0
 """Stretch s of the densest grid, in standard deviations of the power at its mode.
@@ -133,7 +133,7 @@ class RescaledClasses(CategoricalDensity):
     """A density over classes whose log-probabilities are `slope` times those of another density, plus constants.
 
     Args:
-        logits: its log-probabilities, with the constants, (*batch, label); they are normalised.
+        logits: log-probabilities of this density, up to a constant per item of the batch, (*batch, label).
         density: the other density, whose Monte Carlo error gives the error of this density.
         slope: a scalar, 1/T for a temperature T.
     """
@@ -175,10 +175,10 @@ def _(density: RescaledClasses, value: Tensor) -> Estimate:
 class CircularPower(DerivedDensity):
     """The density p^(1/T) / Z for a density p of one angle; Z is computed by the trapezium rule on a grid.
 
-    The grid starts at the mode, so that no peak is missed there. It is refined until it resolves the power and until p
-    has its mass on it. A power that is too narrow for MOST_POINTS equally spaced angles gets a stretched grid, which is
-    denser about the mode: the angles mode + 2 atan(s tan(u/2)) for equally spaced u and a stretch s. The rule is
-    spectrally exact on these angles too.
+    The grid starts at the mode, so that no peak is missed there. It is refined until it resolves the power, and until
+    the integral of p over it is about 1. A power that is too narrow for MOST_POINTS equally spaced angles gets a
+    stretched grid, which is denser about the mode: the angles mode + 2 atan(s tan(u/2)) for equally spaced u and a
+    stretch s. The trapezium rule is spectrally exact on these angles too.
 
     Samples are drawn by the inverse of the distribution function. This function is computed at the angles of the grid
     and at QUANTILES quantiles of p^(BROADER/T), and the density is taken as linear between these angles. The distance

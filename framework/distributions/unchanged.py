@@ -15,7 +15,7 @@ from framework.distributions.protocol import ValueSet, value_set
 
 
 class Unchanged(Mixture):
-    """A mixture of one density, which equals this density to the last bit; a subclass adds what it knows besides.
+    """A mixture of one density, which equals this density to the last bit; a subclass adds further information.
 
     Args:
         density: any density.

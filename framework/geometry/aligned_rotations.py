@@ -27,16 +27,17 @@ from framework.geometry import quaternions
 SAMPLING_ROUNDS = 96
 """Largest number of proposals per sample.
 
-At least 45 % of proposals are accepted (README), so that fewer than one sample in 10^24 has no accepted proposal after
-96.
+At least 45 % of proposals are accepted (README of the plugin for matrix Fisher densities). After 96 proposals, fewer
+than one sample in 10^24 has no accepted proposal.
 """
 REACH = 44.0
 """Exponent beyond which terms are neglected, since exp(-44) is less than half the last digit of float64."""
 NODES = (64, 48)
 PANEL = 4.0
-"""Length in y of the last of the two panels, which have NODES nodes.
+"""Length of the last of the two panels of a quadrature, in the variable of integration y.
 
-With these 112 nodes the error of log k is at most 3e-14 for falls from 0 to 1e30 (README).
+The two panels have NODES nodes, 112 in all. With these the error of log k is at most 3e-14 for falls from 0 to 1e30
+(README of the plugin for matrix Fisher densities).
 """
 LARGE = 25.0
 """Concentration above which the asymptotic series of I₁/I₀ is exact to the last digit."""

@@ -24,10 +24,11 @@ def scale_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 def balance_losses(
     losses: Float[Tensor, "*batch number"], scale: Float[Tensor, "*batch number"], balance: float
 ) -> Float[Tensor, "*batch number"]:
-    """Return the losses of each number, whose gradient is multiplied by the number's scale to the power 2β.
+    """Return the losses of each number, but with gradients multiplied by the number's scale to the power 2β.
 
-    This is the loss β-NLL of Seitzer et al. 2022, except that the value of the losses is unchanged. Without it, a
-    location is learned more slowly the wider its scale is; with β = 1 all locations are learned as with squared error.
+    This is the loss β-NLL of Seitzer et al. 2022, except that the value of the losses is unchanged. With β = 0, the
+    wider the scale of a number is, the more slowly its location is learned. With β = 1, all locations are learned as
+    with squared error.
 
     Args:
         losses: negative log-likelihood of each number.

@@ -21,7 +21,10 @@ from framework.geometry.nearest.exponents import MOST
 OFTEN = 2**16
 """Largest number of queries that `processor.packed_well` packs in less than a second."""
 FEW_IN_TRACE, MOST_PARTS = 64, 16
-"""Number of queries that the search in a trace computes at a time, and largest number of parts of all queries."""
+"""Number of queries that `nearest_in_trace` computes at a time, and largest number of such parts.
+
+With more than 64 · 16 queries, the parts are larger.
+"""
 
 
 class Nearest(NamedTuple):

@@ -241,7 +241,7 @@ UNUSED = {dtype.itemsize: room(1, dtype) for dtype in (np.dtype(np.float32), np.
 
 
 KEPT = 2**20
-"""Largest number of points or queries of which working memory is kept, which is then 25 MB for each thread."""
+"""Largest number of points or queries for which working memory is kept between searches, 25 MB for each thread."""
 
 
 class Desks(local):

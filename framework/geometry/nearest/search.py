@@ -1,8 +1,9 @@
 """Exact search for the nearest point of a packed cloud to each of many queries.
 
 The queries are packed too (`pack`). Sixteen neighbouring queries, a leaf of the packed queries, walk through the
-cloud's tree together. A node is opened if its box is nearer to the box of the sixteen queries than the largest of their
-smallest distances so far. Then the boxes of its children are compared with each query. If only a few of the sixteen
+cloud's tree together. Each query has a smallest distance so far. A node is opened if the distance from its box to the
+box of the sixteen queries is at most the largest of these sixteen distances. Then the boxes of its children are
+compared with each query. If only a few of the sixteen
 queries need a child, each of these queries continues alone, and is compared with sixteen boxes or points at a time. The
 first guesses are the nearest points of the previous sixteen queries, or points found by `descend` in a large cloud.
 
@@ -39,15 +40,16 @@ from framework.geometry.lanes import (
 from framework.geometry.nearest.compiled import compiled, inlined
 
 ALONE = 3
-"""Largest number of queries, of sixteen, for which a node that they need is searched query by query; measured.
+"""Largest number of the sixteen queries for which a node that they need is searched query by query.
 
-ALONE_IN_LEAF is the same number for leaves.
+ALONE_IN_LEAF is the same number for leaves. Both were found by measurement.
 """
 ALONE_IN_LEAF = 8
 HIGH = 3
-"""Topmost level from which on the first guess of a query is a point of the leaf to which the nearest boxes lead.
+"""Smallest topmost level of a cloud's tree at which the first guess of a query comes from `descend`.
 
-For smaller clouds that takes longer than it saves. Their first guesses are the nearest points of the packet before.
+In a cloud with a lower tree, `descend` takes longer than it saves. There the first guesses of a packet are the nearest
+points of the packet before.
 """
 
 
