@@ -148,7 +148,8 @@ def reader(description: Description, chosen: Data | None = None) -> Data:
 
     Args:
         description: Description of the model.
-        chosen: This data set, if the caller has built it already; None: it is built here.
+        chosen: Data set that the caller has built already, and which is then returned; None: it is built from the
+            description.
     """
     with translate_errors(
         Path(description.path), "a checkpoint of this framework", FOREIGN, kind=CheckpointError

@@ -127,14 +127,15 @@ class BudgetSettings(_Strict):
     error: Annotated[float, Field(allow_inf_nan=False)] | None = None
     """Largest error on the validation split, in the unit of `metric`; the model gets the fastest setting within it."""
     metric: str | None = None
-    """Key of the number of the model's metrics that is the error, such as `maad_deg`.
+    """Name of the error among the numbers that the model's metrics compute, such as `maad_deg`.
 
-    null takes the first for which lower is better. If higher is better, `error` is the smallest allowed number.
+    null chooses the first number that is better if it is lower. If the chosen number is better if it is higher, `error`
+    is its smallest allowed value.
     """
     batch_size: Positive | None = None
     """Number of samples of the batch whose run time is measured.
 
-    null takes 64 for mode=predict, which predicts so many at once, and 1 for mode=export and `framework.load`.
+    null means 64 for mode=predict, which predicts 64 samples at once, and 1 for mode=export and `framework.load`.
     """
 
     @model_validator(mode="after")

@@ -44,9 +44,15 @@ from framework.target import Target
 FORMAT = 1
 """Version of the layout of density.json."""
 PARITY = 1e-5
-"""Largest difference between the exported and the original model's parameters, as a share of the largest parameter."""
+"""Largest accepted difference between the exported and the original model's parameters of the density.
+
+It is a share of the largest parameter.
+"""
 ROUNDING = 4.0
-"""The difference for extreme inputs may be so many times the original model's own difference from float64."""
+"""Factor on the rounding error of the original model, up to which a difference is accepted for extreme inputs.
+
+The rounding error is the difference between the original model and the same model in float64.
+"""
 DENSITY_PARITY = 1e-4
 """Largest difference between the exported and the original log-densities, as a share of max(1, |log-density|)."""
 EXTRA = "pip install 'robust-visual-learning[export]'"
@@ -159,8 +165,8 @@ class Traced(nn.Module):
 
     Args:
         model: the model.
-        used: whether each array of random numbers that the model draws is given to `forward`; the parameters of the
-            density do not depend on the others.
+        used: for each array of random numbers that the model draws, whether `forward` gets it as an argument; the
+            parameters of the density do not depend on the other arrays.
     """
 
     def __init__(self, model: Exporting, used: Sequence[bool]) -> None:

@@ -2,9 +2,9 @@
 
 The computation from features to raw parameters is read from the model's graph (torch.export), so no encoder has to
 declare its layers. If the graph contains fully connected layers only, batch norm is folded into the weights of the
-neighbouring layers, and dropout is removed. One compiled function then computes the raw parameters of one sample, and
-ONNX Runtime or torch's matrix products those of more. The networks of any other model are computed by ONNX Runtime if
-the extra `export` is installed, and by torch otherwise; the density is computed by torch.
+neighbouring layers, and dropout is removed. A compiled function then computes the raw parameters if the batch has one
+sample, and ONNX Runtime or torch computes them if it has more. The networks of any other model are computed by ONNX
+Runtime if the extra `export` is installed, and by torch otherwise; the density is computed by torch.
 """
 
 import copy

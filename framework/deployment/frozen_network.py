@@ -24,7 +24,10 @@ from framework.model import Model
 from framework.storage.kernels import compiler, kernel_cache
 
 LEAVES = (nn.Linear, nn.BatchNorm1d, nn.ReLU, nn.Dropout, nn.Flatten, nn.Identity, nn.Sequential)
-"""Layers that a network may have; a model with other layers is not exported: the export would take long and fail."""
+"""Layers that a `Network` may have.
+
+A model with other layers is not traced by torch.export, because the trace would take long and then fail.
+"""
 FEW = 8  # largest batch for which the compiled softmax is faster than torch's
 MOST_RAW = 2048  # largest number of raw parameters of a head that is tested for a softmax
 
@@ -77,8 +80,9 @@ class Network:
     The intermediate results are called registers and numbered. Register 0 has the features, (batch, length). Each step
     reads registers of earlier numbers, and its output is the next register.
 
-    For one sample the layers are compiled functions. For two or more, ONNX Runtime is faster, and torch where it is not
-    installed, because they read the weights once for all of them (benchmarks/framework/frozen.md).
+    For one sample the layers are compiled functions. Two or more samples are computed by ONNX Runtime or, if it is not
+    installed, by torch. Both are then faster, because they read the weights only once for all samples of the batch
+    (benchmarks/framework/frozen.md).
 
     Attributes:
         steps: the steps, in order.

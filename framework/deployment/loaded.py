@@ -45,10 +45,10 @@ def load(
         uri: Tracking store of the run id; the local store under `outputs/` by default.
         paths: Files and folders by their keys in the model's config, {"encoder.rasterised.body": "/my/body.npz"}. Paths
             in the checkpoint itself are never used, because it may come from an untrusted source.
-        budget: Either `milliseconds`, the largest run time per sample of a density, its point prediction and the error
-            measure, or `error`, the largest error on the validation data; and, if wanted, `metric`, the key of the
-            number of the model's metrics that is the error, and `batch_size`, the number of samples of a timed call (1
-            by default).
+        budget: One limit, and up to two options. The limit is either `milliseconds`, the largest run time per sample,
+            or `error`, the largest error on the validation data. The run time is that of the density, the point
+            prediction and the error. The option `metric` says which number of the model's metrics is the error. The
+            option `batch_size` is the number of samples of a timed call, 1 by default.
 
     Raises:
         CheckpointError: There is no checkpoint, it is damaged, or its weights do not fit the model that it describes.

@@ -47,7 +47,13 @@ class OnnxNetwork(nn.Module):
                     raise ArithmeticError
 
     def forward(self, inputs: Tensor, used: int | None = None) -> Tensor:
-        """Return the raw parameters; with `used`, those of the first `used` members of a `RawNetwork`."""
+        """Return the raw parameters; `used` limits the result to the first members of an ensemble.
+
+        Args:
+            inputs: inputs of the network.
+            used: number of members whose raw parameters are returned, if the network is a `RawNetwork`, which computes
+                all members of an ensemble; None for all members, and for any other network.
+        """
         same = inputs.shape[1:] == self.shape and inputs.dtype == self.dtype and len(inputs)
         # ONNX Runtime may drop NaN in a maximum
         if not same or not math.isfinite(inputs.sum()):

@@ -164,9 +164,10 @@ def meet_budget(
 ) -> str:
     """Set the knobs of a trained predictor to the cheapest setting that meets a budget, and say why in a sentence.
 
-    With a limit of the run time, the settings within the limit are compared. The fastest of those whose error is as low
-    as the lowest one, up to the standard error of the difference (`Bench.equals`), is chosen. With a limit of the
-    error, the fastest setting whose error on the validation samples is within the limit is chosen.
+    With a limit of the run time, the settings within the limit are compared. A setting counts as equal to the one with
+    the lowest error if their difference is within its standard error (`Bench.equals`). Of these equal settings, the
+    fastest is chosen. With a limit of the error, the fastest setting whose error on the validation samples is within
+    the limit is chosen.
 
     Args:
         predictor: the predictor, in evaluation mode; its knobs are set.

@@ -107,7 +107,15 @@ class Painter:
 
     @torch.no_grad()
     def draw(self, scenes: Sequence[Scene], name: str) -> list[dict[str, Tensor]]:
-        """Return what the renderer draws for scenes with four channels; `name` stands in an error message."""
+        """Return the channels that the renderer draws for each scene.
+
+        Args:
+            scenes: scenes whose colours have four channels, as in `Frame`.
+            name: name of the frame, for the error message.
+
+        Raises:
+            DataError: the renderer cannot draw a scene.
+        """
         if self._on_own_ground:
             scenes = [without_cover(scene) for scene in scenes]
         try:

@@ -103,7 +103,16 @@ def predict(
     split: Split = "test",
     reads: Collection[str] = (),
 ) -> Prediction:
-    """Return the prediction for a batch, the same in every mode, because all random numbers come from `draw`."""
+    """Return the prediction for a batch; it is the same in every mode, because all random numbers come from `draw`.
+
+    Args:
+        predictor: the trained predictor.
+        batch: the batch, on the predictor's device.
+        samples: as in `Prediction`.
+        draw: source of the random numbers.
+        split: source of the batch.
+        reads: as in `Prediction`.
+    """
     with draw(split):
         density = predictor(batch["input"])
     return Prediction(density, batch, samples, split, draw, reads)
