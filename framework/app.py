@@ -42,7 +42,11 @@ PAGES = {
     "-m": "docs/how_to/sweeps.md",
     "--multirun": "docs/how_to/sweeps.md",
 }
-"""Page of the documentation that helps after an error, by the beginning of a word of the command; the first counts."""
+"""Page of the documentation that helps after an error of a command.
+
+A page belongs to a command if one of the command's words begins with the key of the page. If several pages belong to
+it, the first of them in this order is named.
+"""
 FIRST_PAGE = "docs/start/by_task.md"
 """Page that helps after an error of any other command."""
 

@@ -40,7 +40,7 @@ class Encoder(nn.Module, ABC):
     constructor may set the attribute.
     """
     fixed: bool = False
-    """True if features are a function of the input alone: they have no trained parameters and no randomness.
+    """True if the features depend on the input alone: the encoder is not trained, and draws no random numbers.
 
     The framework then computes them once per sample and not once per epoch, if neither the data nor an objective varies
     the inputs.

@@ -190,8 +190,8 @@ class Backbones(Encoder):
 class RawNetwork(nn.Module):
     """Base class of modules other than `Model` that compute raw parameters, such as the stacked members of an ensemble.
 
-    A frozen predictor may compute it by other means than torch: its results must be a function of its inputs, and of
-    the number of members that is its second argument.
+    Its results must be a function of its inputs and of its second argument, the number of members, alone. A frozen
+    predictor may therefore replace it by code that does not use torch.
     """
 
 

@@ -59,6 +59,6 @@ class Objective(nn.Module, ABC):
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
         """Return the weighted penalty on this batch, a scalar in nats, differentiable in the predictor's parameters.
 
-        If the predictor predicts images, those for the inputs of `batch` were computed for the loss already and are
-        reused (`framework.model.one_pass`).
+        If the predictor predicts images, the images for the inputs of `batch` were computed for the loss already, and
+        are reused (`framework.model.one_pass`).
         """

@@ -22,9 +22,9 @@ class Target:
             is a float tensor of shape (batch, len(names)). For classes the label names; a batch of targets is an int64
             tensor of shape (batch,). For images the channels, ("red", "green", "blue"); a batch of targets is a float
             tensor of shape (batch, height, width, len(names)).
-        location: for reals, the mean of each number over the training split. A head is scaled by it and by `scale`, so
-            that its raw parameters are of the order of 1 in any unit. () if the numbers are of that order already; the
-            head then takes 0 and 1.
+        location: for reals, the mean of each number over the training split. A head computes with numbers that are
+            standardised by `location` and `scale`, so that its raw parameters are of the order of 1 in any unit of the
+            target. () if the numbers are of that order already; they are then not standardised.
         scale: for reals, the standard deviation of each number over the training split; () as for `location`.
         size: for images, (height, width) in pixels; () for every other kind.
     """

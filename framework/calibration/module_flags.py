@@ -14,7 +14,10 @@ BATCH_NORM = (
 
 @contextmanager
 def evaluation_mode(model: nn.Module) -> Iterator[None]:
-    """Set a model to evaluation inside the `with` block; after it, also after an error, to the mode that it had."""
+    """Set a model to evaluation mode inside the `with` block.
+
+    After the block, also after an error, the model has its own mode again.
+    """
     training = model.training
     try:
         model.eval()

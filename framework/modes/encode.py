@@ -263,7 +263,7 @@ def require_apart(root: Path, into: Path) -> None:
     """Refuse a folder for the features that lies inside the folder of the files.
 
     Raises:
-        ConfigError: The folder lies there.
+        ConfigError: The folder for the features lies inside the folder of the files.
     """
     if into.resolve().is_relative_to(root.resolve()):
         raise ConfigError(

@@ -22,10 +22,11 @@ def choose_classified(
 ) -> dict[str, list[int]]:
     """Return the indices of up to `count` samples for each row of the figure, by row name; no sample occurs twice.
 
-    "failed" has samples whose most likely class is wrong, in descending order of its probability. "certain" has samples
-    whose most likely class is right, in descending order of its probability, but first one sample of each class, then a
-    second one of each class, and so on. "ambiguous" has other samples, right or wrong, in ascending order of the
-    difference between the probabilities of the two most likely classes. The choice is deterministic.
+    The most likely class of a sample is its guess. "failed" has samples with a wrong guess, in descending order of the
+    guess's probability. "certain" has samples with a right guess: first the sample of each class whose guess is most
+    probable, then the second sample of each class, and so on. "ambiguous" has other samples, right or wrong, in
+    ascending order of the difference between the probabilities of the two most likely classes. The choice is
+    deterministic.
     """
     if len(probability) == 0:
         return {"certain": [], "ambiguous": [], "failed": []}

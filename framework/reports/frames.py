@@ -31,7 +31,7 @@ MOST_SHOWN = 6
 HEADINGS = {
     key: heading.replace("sample", "frame") for key, heading in COST_COLUMNS.items() if "sample" in heading
 }
-"""Headings of costs, which count frames."""
+"""Headings of costs in a table of frames, which say "frame" in place of "sample"."""
 Rendered = tuple[str, UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "_height _width 3"] | None]
 """A frame for the figure: its name, the drawn image, and the true image or None, in 8-bit sRGB."""
 

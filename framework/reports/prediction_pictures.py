@@ -28,7 +28,10 @@ from framework.runs.session import Session
 PICTURED = 128
 """Number of test samples from which the samples of a figure are chosen."""
 MOST_NUMBERS, MASS = 4, 0.9
-"""Largest number of real numbers whose intervals are drawn, and the probability of an interval that no set states."""
+"""Largest number of real numbers in a target whose intervals are drawn, and the probability of these intervals.
+
+If the model predicts sets of one number with a stated probability, these sets are drawn instead.
+"""
 POINTS = 720
 """Number of angles at which a density on the circle is drawn."""
 UNRESOLVED, DRAWS, TIMES = 0.01, 1000, 10

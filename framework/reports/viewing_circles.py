@@ -31,9 +31,10 @@ def choose(
 ) -> dict[str, list[int]]:
     """Return the indices of up to `count` samples for each row of the figure (thesis Figure 3.6), by the row's name.
 
-    "certain" has samples whose density has one peak, an entropy of at most the median, and an error of at most π/6.
-    "failed" has samples with one peak, such an entropy, but a larger error. "ambiguous" has samples with several peaks.
-    Each row shows the samples of lowest entropy among these. The choice is deterministic.
+    A density is confident if it has one peak, and an entropy of at most the median entropy of all samples. "certain"
+    has samples with a confident density and an error of at most π/6, "failed" has samples with a confident density and
+    a larger error, and "ambiguous" has samples whose density has several peaks. Of the samples of a row, those with the
+    lowest entropy are shown. The choice is deterministic.
 
     Args:
         entropy: entropy of each density, nats.

@@ -34,7 +34,10 @@ LARGEST_PAGE = 9_000_000
 """Size of a page, bytes, beyond which further figures are left out, so that a browser opens it soon."""
 LARGEST_FIGURE = 4_000_000
 NO_NOTES = ("threads:", "reads ", "samples:", "draws ", "compiling functions", "features of ", " ")
-"""Beginnings of lines that a run prints before training and that are no notes; a table is indented."""
+"""Beginnings of lines that a run prints before training and that the page does not show as notes.
+
+The last one, a blank, is the beginning of each line of a table.
+"""
 PROGRESS = re.compile(r": \d+ of \d+ \w+ in \d+ s$")
 """End of a line that reports progress of long work (`framework.storage.progress.Work`)."""
 NAMES = ("report.html", "report.md", "report.tex")

@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 
 Form = Literal["csv", "tensorboard", "wandb"]
 PACKAGES: Mapping[Form, str] = {"tensorboard": "tensorboard", "wandb": "wandb"}
-"""Package that a format needs; it is the project's extra of the same name."""
+"""Package that a format needs; the extra of this project with the name of the format installs it."""
 
 
 def require_packages(forms: Sequence[Form]) -> None:

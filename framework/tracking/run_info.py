@@ -22,7 +22,10 @@ _log = logging.getLogger(__name__)
 
 SIDECAR = "run.json"
 MODEL = "model:"
-"""Name to give as `folder` of a checkpoint that the store shall keep as the run's model, not as a file."""
+"""Value of `folder` in `Tracker.log_artifact` for a checkpoint that the store keeps as the model of the run.
+
+With any other value, the store keeps the checkpoint as a file.
+"""
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,9 @@ def address(named: str | None, folder: Path) -> Address:
 
 
 def confirm_address(recorded: str, named: str | None, folder: Path, source: Path) -> Address:
-    """Return the address, given by the user or the default one, of the store that a file names for a run.
+    """Return the address of the store that a file names for a run, after checking that the user may mean this store.
+
+    The address in the file is only compared: the returned address is one that the user gives, or a default address.
 
     Args:
         recorded: Address of the store in the file.

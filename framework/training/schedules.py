@@ -81,7 +81,7 @@ class Plateau:
         return warmup_factor(step, self.warmup_steps) * self.factor**self.reductions
 
     def record_loss(self, loss: float, epochs: int) -> None:
-        """Record the loss after `epochs` epochs; reduce the factor if it did not fall for `patience` epochs."""
+        """Record the loss after `epochs` epochs; reduce the factor if the loss has not fallen for `patience` epochs."""
         if loss < self.best:
             self.best, self.since = loss, epochs
         elif epochs - self.since >= self.patience:
