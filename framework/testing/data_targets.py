@@ -9,7 +9,7 @@ from framework.testing.data_samples import batches, indices_to_check, remove_pad
 from framework.testing.finding import SEED, Worst
 
 LEAST, MOST = 192, 960
-"""Number of samples that a split needs to be checked, and largest number of its samples that are used."""
+"""Smallest number of samples with which a split is checked, and largest number of its samples that are used."""
 BLOCK = 48
 """Number of consecutive samples whose errors are averaged."""
 NEIGHBOURS = 7
@@ -24,7 +24,7 @@ Below the first bound, inputs predict targets. Above the second bound, they do n
 
 
 def check_targets_belong(data: Data, worst: Worst) -> None:
-    """Check that inputs predict their own targets in every block of a split, if they do in most blocks.
+    """Check that inputs predict their own targets in every block of a split, if they predict them in most blocks.
 
     A target is predicted by the median target of the samples with the nearest inputs. If inputs do not predict their
     own targets, they must not predict the targets of the previous or the next sample either.

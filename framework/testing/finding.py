@@ -71,7 +71,8 @@ class Worst:
 
         Args:
             error: Error, or errors in a tensor of any shape.
-            case: Description of the case, or function from the index of the largest error in the tensor to it.
+            case: Description of the case, or a function that returns the description for the index of the largest
+                error in the tensor.
         """
         if not isinstance(error, Tensor):
             error = torch.tensor(float(error), dtype=torch.float64)

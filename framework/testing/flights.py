@@ -15,13 +15,16 @@ STEP = 0.016
 SIGMA = 0.003
 """Standard deviation of the noise of observed positions from `simulate_windows`, metres."""
 START = np.array([0.8, -4.1, -0.62, -0.6, 6.2, 1.6, 20.0, -30.0, 10.0])
-"""Position, velocity and spin, in the first frame, of a ball that lands on the table; metres and seconds."""
+"""Position (m), velocity (m/s) and spin (rad/s), in the first frame, of a ball that lands on the table."""
 TWO_FRAMES = Target("real", future_names(2, STEP))
 """Target of a ball's positions in the next two frames."""
 
 
 def falling_balls(count: int) -> Float[Tensor, "flight number"]:
-    """Return observations of falling balls in six frames, each with the time, position and visibility of the ball."""
+    """Return flattened observations of `count` falling balls in six frames of five numbers each.
+
+    The numbers are time (s), x, y, z (m), and whether the ball was seen, which is always true.
+    """
     since = STEP * torch.arange(-5.0, 1.0).expand(count, -1)
     height = torch.linspace(-0.2, 0.2, count).unsqueeze(-1) - 4.9 * since.square()
     frames = [since, 0.5 * since, 5 * since - 3, height, torch.ones_like(since)]

@@ -326,7 +326,7 @@ def _compute_quietly(build: Make, predict: Predict, parts: Sequence[Tensor]) -> 
 
 
 class Many:
-    """Many predictions, and the numbers of a metric for all of them.
+    """Many predictions, and the numbers that a metric computes from all of them.
 
     Attributes:
         predictions: Predictions.

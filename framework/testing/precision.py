@@ -47,8 +47,8 @@ def precision(subject: HeadSubject, worst: Worst) -> None:
 
     The error is relative to max(1, |log p|) plus the change of log p from rounding the raw parameters and angles. So a
     large error comes from cancellation inside the head. For a head with parameters of its own, the change from rounding
-    them is added where the error is large. Where log p jumps, as at the border of a step, the result may also be that
-    on the other side, a few float32 epsilons of the value and of the raw parameters away.
+    these parameters is added where the error is large. log p may jump, as at the border of a cell in which the density
+    is constant. Within a few float32 epsilons of such a border, the result may be the log-density on either side of it.
     """
     single = subject.make()
     double = copy.deepcopy(single).double()

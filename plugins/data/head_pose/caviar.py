@@ -28,6 +28,12 @@ class Caviar(Heads):
     """Partly hidden heads of people in a shopping centre, and their gaze; generated if no root is given.
 
     Training mirrors no images, because the thesis authors' data hold no mirror images.
+
+    Args:
+        root: The unpacked CAVIARShoppingCenterFullOccl; None to generate images in the same layout.
+        reading: Settings for reading images.
+        images: Number of generated images.
+        generator_seed: Seed of the generated images.
     """
 
     bibtex = "fisher2005caviar, tosato2013characterizing"

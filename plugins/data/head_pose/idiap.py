@@ -28,6 +28,14 @@ class Idiap(Heads):
     """Heads of a few people in a meeting room, and their pan, tilt and roll; generated if no root is given.
 
     Training mirrors no images, because the published set already contains the mirror images.
+
+    Args:
+        root: The unpacked IHDPHeadPose; None to generate images in the same layout.
+        angles: Angles to predict, in this order; None for pan, tilt and roll.
+        angles_in: Unit of the angles in the label file of `root`; generated labels are in radians.
+        reading: Settings for reading images.
+        images: Number of generated images.
+        generator_seed: Seed of the generated images.
     """
 
     bibtex = "ba2005evaluation, tosato2013characterizing"

@@ -28,6 +28,13 @@ AS_PUBLISHED = Reading(image_size=SIDE)
 class TownCentre(Heads):
     """Heads of pedestrians seen by a surveillance camera, and their pan; generated if no root is given.
 
+    Args:
+        root: The unpacked TownCentreHeadImages; None to generate images in the same layout.
+        reading: Settings for reading images.
+        mirror: Whether half of the training images are mirrored left to right.
+        images: Number of generated images, some of which are marked as not valid.
+        generator_seed: Seed of the generated images.
+
     Attributes:
         invalid: Number of heads that are left out because their labels mark them as not valid; `prepare` sets it.
     """

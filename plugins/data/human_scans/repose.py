@@ -99,7 +99,7 @@ def subject(body: Body, few: Body, registration: RegisteredMesh, source: str) ->
 
 
 def a_pose_with(changes: str) -> Float[np.ndarray, "1 movement"]:
-    """Return the movements, degrees, of an A-pose with some of them replaced: "left raise=90,left elbow=60".
+    """Return the movements, degrees, of an A-pose, some of which `changes` replaces: "left raise=90,left elbow=60".
 
     Raises:
         DataError: no movement has such a name, or an angle is not a number.
@@ -158,10 +158,12 @@ def requested_poses(body: Body, options: argparse.Namespace) -> Poses:
 
 
 def shape_change(text: str, count: int) -> Float[Tensor, "shape"]:
-    """Return the change of every shape coefficient, from a text such as "0=-2,3=1"; it is 0 if the text names none.
+    """Return the change of each of `count` shape coefficients, as a text such as "0=-2,3=1" states it.
+
+    Coefficients that the text does not name have the change 0.
 
     Raises:
-        DataError: the text has another form, or a direction does not exist.
+        DataError: the text has another form, or names a coefficient that does not exist.
     """
     coefficients = torch.zeros(count, dtype=torch.float64)
     for name, number in _numbers(text).items():

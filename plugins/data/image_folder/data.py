@@ -158,8 +158,8 @@ class TurnedImages(LabelledData):
     """A user's own images, each turned by a random angle, which is the target; classes are groups of the results.
 
     An image is turned counter-clockwise about its centre, and only the largest disc inside the square is kept, since
-    corners would tell the angle. An image of validation and test is always turned by the same angle. A training image
-    is turned by a new angle in every epoch.
+    the corners would reveal the angle. An image of the validation or test split is always turned by the same angle. A
+    training image is turned by a new angle in every epoch.
 
     Args:
         root: Folder of the images. It holds folders that are named by class, perhaps within folders train, validation

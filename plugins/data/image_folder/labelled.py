@@ -79,8 +79,10 @@ class LabelledImages:
         csv: Path of a table with the columns `file`, `label` and perhaps `split`, relative to the folder of the images;
             None: folders or idx files state the classes.
         classes: Names of the classes to read; None for all.
-        validation: Share of the images for validation, equal in every class, if no folder or column states it.
-        test: Share of the images for the test, equal in every class, if no folder, file or column states it.
+        validation: Share of the images for validation, equal in every class, if no folder or column states which images
+            are for validation.
+        test: Share of the images for the test, equal in every class, if no folder, file or column states which images
+            are for the test.
         data_seed: Seed of the splits, independent of the seed of the run.
         image_size: Side of the square inputs, pixels.
         grayscale: Whether images are read in grey.

@@ -115,6 +115,14 @@ class Pascal3D(Data):
     In addition to the fields that `framework.data.Batch` requires, a batch holds "symmetry" (1 for real data) and, for
     generated data, "blur" (float32, the standard deviation of the blur, pixels of the input).
 
+    Args:
+        root: The unpacked PASCAL3D+_release1.1; None to generate images in the same layout.
+        selection: Choice of the objects.
+        framing: Settings of the crop of an object.
+        skip_unreadable: Whether files that cannot be read are left out and counted; otherwise they are an error.
+        variation: Random variation of training images.
+        drawing: Settings of the generated images.
+
     Attributes:
         excluded: Number of objects that the protocol leaves out, by reason; `prepare` sets it.
     """

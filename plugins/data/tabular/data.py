@@ -54,7 +54,8 @@ class Tabular(Data):
         small_angles: Whether angles in degrees may all lie within ±2π; by default this is refused, because such angles
             look like radians.
         words: Treatment of columns of words. "leave_out" does not read them; "levels" reads a column of 0 and 1 for
-            each of up to 50 different words. Words that the training table does not have are read as none of them.
+            each of up to 50 different words. A word that does not occur in the training table is read as 0 in all these
+            columns.
         writing: Notation of the file, and of further files for prediction: separator, decimal sign and the like.
     """
 

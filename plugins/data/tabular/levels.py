@@ -47,7 +47,9 @@ def expand_words(cells: Columns, but: Collection[str]) -> tuple[Columns, Mapping
 
 
 def add_levels(cells: Columns, names: Sequence[str]) -> Columns:
-    """Return a table to which the columns of levels that it lacks are added, and log levels that have no column.
+    """Return the table with added columns of the levels that a model reads, computed from its columns of words.
+
+    A warning names levels in the table that the model does not know.
 
     Args:
         cells: The table, with columns of words.
@@ -63,7 +65,7 @@ def add_levels(cells: Columns, names: Sequence[str]) -> Columns:
 
 
 def known_levels(names: Sequence[str], present: Collection[Any]) -> dict[str, list[str]]:
-    """Return the levels that a model reads of each column of words in a table, by the name of the column.
+    """Return, for each column of words in a table, the levels that a model reads from it, by the name of the column.
 
     Args:
         names: Columns that the model reads.

@@ -15,7 +15,9 @@ LARGEST_NORM = 1 + 1e-6
 Outliers of a robust normalisation have larger norms.
 """
 EIGENVALUE_GAP = 1e-9
-"""Difference of eigenvalues, in units of the largest, below which they count as equal and have no derivative of axes.
+"""Difference of two eigenvalues, in units of the largest eigenvalue, below which they count as equal.
+
+The axes of equal eigenvalues have no derivative.
 
 An eigenvalue smaller than this share of the largest counts as 0: a cloud thinner than 3e-5 of its length is flat.
 """

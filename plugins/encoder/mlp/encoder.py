@@ -17,8 +17,8 @@ Probability = Annotated[float, Field(ge=0, lt=1)]
 class MLP(Encoder):
     """Fully connected layers on the flattened input.
 
-    Each layer is linear, batch norm if requested, an activation, dropout. With
-    `batch_norm="after_relu"` the order is linear, activation, batch norm, dropout, as in the blocks of thesis §6.5.1.
+    Each layer consists of a linear map, batch norm if requested, an activation and dropout, in this order. With
+    `batch_norm="after_relu"` batch norm follows the activation, as in the blocks of thesis §6.5.1.
 
     Args:
         input_shape: any; a sample is flattened.

@@ -8,7 +8,7 @@ from framework.encoder import Encoder, FitsInputs, require_numbers
 from framework.storage.weights import require_state
 
 KNOTS = 128
-"""Largest number of values of a number between which its scores are interpolated."""
+"""Largest number of stored values of an input number; scores are stored for these values and interpolated between."""
 WIDEST = 8.0
 """Bound of the scores, which no rank of float64 exceeds."""
 
@@ -20,7 +20,7 @@ class NormalScores(Encoder, FitsInputs):
     their mean rank), scaled to mean 0 and standard deviation 1 over the training samples. Between training values it is
     interpolated linearly, and beyond them it is constant. So skewed numbers become normal, and no extreme value leaves
     the range that the model was trained on, while the unchanged number preserves distances. Before `fit_inputs`, the
-    score of a number is the number, within ±3.
+    score of a number is the number itself, clamped to ±3.
 
     Args:
         input_shape: any; a sample is flattened.

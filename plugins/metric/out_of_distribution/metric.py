@@ -22,14 +22,15 @@ class OutOfDistribution(Metric):
 
     - `ood_entropy`, `ood_entropy_sem`: mean entropy on outliers and its standard error; `entropy_test`: mean entropy on
       the test split. One infinite entropy makes the mean infinite.
-    - `auroc`, `auroc_sem`: probability that an outlier has a higher score than a test sample, and its standard error
-      over both (DeLong et al. 1988); equal scores count half. The error is NaN with a single outlier or test sample.
+    - `auroc`, `auroc_sem`: probability that an outlier has a higher score than a test sample, where equal scores count
+      half; and its standard error from the variation of outliers and of test samples (DeLong et al. 1988). The standard
+      error is NaN with a single outlier or test sample.
     - `aupr`: average precision with outliers as the positives; it depends on the share of outliers.
     - `fpr95`: share of test samples that are classified as outliers at the highest threshold that detects 95 % of the
       outliers. A score equal to the threshold counts as above it (Hendrycks et al. 2019). Papers that use the test
       split as the positives report different values.
 
-    The last three results are NaN if there are no outliers or no test samples.
+    `auroc`, `aupr` and `fpr95` are NaN if there are no outliers or no test samples.
 
     Args:
         score: score that is high on outliers. "entropy" is the entropy of the density. "confidence" is the negative

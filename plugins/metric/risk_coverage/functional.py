@@ -90,11 +90,12 @@ def error_at_coverage(
 ) -> Float[Tensor, ""]:
     """Return the standard error of `at_coverage`; NaN for fewer than 2 predictions.
 
-    The statistic is the mean risk θ of predictions above the quantile of the confidence that a share c exceeds. The
-    influence of a prediction on it is 1[above] (r - m)/c + m - θ, where m is the mean risk of predictions at the
-    quantile (delta method; Hampel 1974). m is the mean over the 2√n + 1 predictions around the quantile. The jackknife
-    is not used, because it would replace m by the risk of a single prediction. Of ties at the quantile, each counts
-    with the share of them that is above.
+    The statistic is the mean risk θ of the share c of predictions with the highest confidence. These predictions lie
+    above a quantile of the confidence. A prediction with the risk r has the influence a (r - m)/c + m - θ on θ, where a
+    is 1 above the quantile and 0 below, and m is the mean risk at the quantile (delta method; Hampel 1974). m is
+    estimated by the mean over the 2√n + 1 predictions around the quantile. The jackknife is not used, because it would
+    replace m by the risk of a single prediction. If several predictions have exactly the confidence at the quantile, a
+    is for each of them the share of them that θ includes.
     """
     count = len(risk)
     if count < 2:

@@ -46,7 +46,12 @@ def normalise(features: Float[Tensor, "image channel height width"]) -> Tensor:
 
 
 class Discriminators(nn.Module):
-    """Patch discriminators at several scales, each with half the resolution of the previous one."""
+    """Patch discriminators at several scales, each with half the resolution of the previous one.
+
+    Args:
+        scales: number of discriminators.
+        width, layers: as in `PatchDiscriminator`.
+    """
 
     def __init__(self, scales: int, width: int, layers: int) -> None:
         super().__init__()

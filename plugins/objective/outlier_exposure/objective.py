@@ -36,8 +36,8 @@ class OutlierExposure(Objective):
         weight: factor λ of the penalty.
         outliers: data from which outliers are drawn; the constructor prepares it.
         low, high: range of uniform random numbers, in the units of the inputs; 0 and 1 for images.
-        count: number of outliers of a training step; None for as many outliers as the batch holds samples for each
-            member of an ensemble.
+        count: number of outliers of a training step. None: the number of samples that one model sees in a step; this
+            is the batch size, divided by the number of members if each member of an ensemble has its own samples.
         clearance: smallest Euclidean distance, in the inputs' unit, of an outlier from every input of the batch; nearer
             outliers are left out, because uniform random numbers also fall among the training data, where a uniform
             density would be wrong. 0 keeps all outliers.

@@ -24,8 +24,8 @@ class RankOne(nn.Module):
         spread: standard deviation of the initial factors around 1.
 
     Attributes:
-        used: number of members that are computed; the rows of the inputs are sample by sample, and member by member for
-            each sample.
+        used: number of members that are computed. The inputs have one row for each sample and member: all members of
+            the first sample, then all members of the second sample, and so on.
         rows: number of rows that the inputs must have; None for any.
     """
 

@@ -33,7 +33,8 @@ class PredictionSet(Density):
     def parts(self) -> list[Any]:
         """Return the labels or intervals of each set; the batch is flattened.
 
-        Intervals are pairs (low, high); of angles, they are arcs in radians, from low counter-clockwise to high.
+        Intervals are pairs (low, high). For an angle, an interval is an arc in radians, from low counter-clockwise to
+        high.
 
         Raises:
             ValueError: the target consists of several numbers, whose sets cannot be listed.

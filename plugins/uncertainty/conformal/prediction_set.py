@@ -19,9 +19,9 @@ from plugins.uncertainty.conformal.highest_density import Ends, Line
 
 Score = Literal["density", "mass", "quantiles"]
 FEW = 8
-"""Number of values per item up to which `contains` compares their scores with the threshold.
+"""Largest number of values per item for which `contains` compares the score of each value with the threshold.
 
-For more values it is faster to compute the log-density that belongs to the threshold once.
+For more values it is faster to compute the log-density at the threshold once, and to compare log-densities with it.
 """
 DRAWS = 1000
 """Number of samples of each density over several numbers, from which scores and volumes of its sets are estimated."""

@@ -21,12 +21,12 @@ from plugins.uncertainty.conformal.prediction_set import PredictionSet, Score
 SEED = 71
 """Seed of the random split into halves."""
 NEAR = 0.03
-"""Accepted deviation of the coverage from the stated one, which should not be exceeded in 90 % of cases.
+"""Deviation from the stated coverage that should not be exceeded for 90 % of all validation splits.
 
-If too few samples are available for this, `coverage_remark` names the number of samples that would suffice.
+If the validation split has too few samples for this, `coverage_remark` names the number that would suffice.
 """
 NINETY = 1.645
-"""Number of standard deviations on both sides of the mean within which a normal density has the probability 0.9."""
+"""Distance from the mean, in standard deviations, within which a normal density has the probability 0.9."""
 _log = logging.getLogger(__name__)
 
 

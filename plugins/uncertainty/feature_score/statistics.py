@@ -19,7 +19,7 @@ ENTRIES = 2**24
 """Largest number of differences of features that are computed at once in the search of neighbours."""
 
 EXACT = "donot_use_mm_for_euclid_dist"
-"""Way to compute distances: a product of matrices would lose the digits of small distances."""
+"""Argument of `torch.cdist` that forbids products of matrices, which would lose the digits of small distances."""
 
 
 class Clusters(NamedTuple):

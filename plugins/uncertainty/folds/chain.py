@@ -12,9 +12,10 @@ POINTWISE = (nn.ReLU, nn.ELU, nn.SiLU)
 ROWS = 128
 """Number of samples that are computed at once without gradient, so that the outputs of a layer stay in the cache."""
 POOL = 2**20
-"""Number of dropout decisions that are drawn at once, beyond those of one layer.
+"""Number of random dropout factors that are kept in addition to the number that one layer needs.
 
-Fresh decisions at every step would double the time of a step; each step reads a part of them at a random place.
+Each step reads a part of the kept factors, from a random position on. Drawing new factors at every step would double
+the time of a step.
 """
 
 
@@ -25,8 +26,9 @@ class Chain(nn.Module):
     trains every member as it would train alone.
 
     Args:
-        networks: networks that `layers_of` accepts; their weights are copied. There are equally many of each group.
-        dropout: probability of all dropout layers, for each group; None keeps the probabilities of the networks.
+        networks: networks that `layers_of` accepts, one group after another; their weights are copied. All groups have
+            the same number of networks.
+        dropout: for each group, the probability of all dropout layers; None keeps the probabilities of the networks.
     """
 
     steps: list[nn.Module]
@@ -92,13 +94,17 @@ class Chain(nn.Module):
         return pool[start : start + count].view_as(numbers)
 
     def forget_masks(self) -> None:
-        """Free the memory of the dropout decisions."""
+        """Free the memory of the random dropout factors."""
         self._pools.clear()
 
 
 @torch.no_grad()
 def build_chain(networks: Sequence[nn.Module], dropout: Sequence[float | None]) -> Chain | None:
-    """Return the networks as a `Chain`; None if they have other layers, or compute something else with them."""
+    """Return the networks as a `Chain`.
+
+    The result is None if a network has layers that `Chain` cannot compute, or if its outputs differ from those of the
+    chain, because its `forward` does more than apply its layers.
+    """
     layers = [layers_of(network) for network in networks]
     first = next((layer for layer in layers[0] or () if isinstance(layer, nn.Linear)), None)
     if first is None or any(part is None for part in layers):

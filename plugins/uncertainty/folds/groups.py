@@ -20,7 +20,7 @@ from plugins.uncertainty.folds.chain import Chain, build_chain
 
 
 class Together(nn.Module):
-    """Models whose layers are stacked, with one head for each group.
+    """Models whose layers are stacked and computed together, with one head for each group.
 
     Args:
         chain: networks of all models, from inputs to raw parameters.
@@ -35,12 +35,15 @@ class Together(nn.Module):
         self._best: list[Tensor] = []
 
     def losses(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "member batch"]:
-        """Return the loss of each model for its own samples, (member, batch, *input), nats."""
+        """Return the loss of each model for its own samples, nats.
+
+        Each model has its own row of `inputs`, (member, batch, *input), and of `target`, (member, batch, *event).
+        """
         return self._head(0).loss(self.chain(inputs.flatten(2)), target)
 
     @torch.no_grad()
     def decay(self, shares: Float[Tensor, "member"]) -> None:
-        """Shrink the weights of each model by a share of them; biases do not shrink."""
+        """Multiply the weights of each model by 1 minus the model's share; biases do not change."""
         for weight in self.chain.weights:
             weight.mul_((1 - shares.to(weight)).view(-1, 1, 1))
 
@@ -66,7 +69,7 @@ class Together(nn.Module):
         return [self._head(group)(raw) for group, raw in enumerate(self._raw(inputs))]
 
     def training_densities(self, inputs: Tensor) -> list[Distribution]:
-        """Return the density of each model that an objective may shape, batch_shape (batch,)."""
+        """Return the densities that objectives read in training: one for each model, batch_shape (batch,)."""
         groups = enumerate(self._raw(inputs))
         return [self._head(group)(part) for group, raw in groups for part in raw.unbind(1)]
 
@@ -129,7 +132,10 @@ class Apart(nn.Module):
         self._best: list[dict[str, Tensor]] = [{} for _ in models]
 
     def losses(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "member batch"]:
-        """Return the loss of each model for its own samples, (member, batch, *input), nats."""
+        """Return the loss of each model for its own samples, nats.
+
+        Each model has its own row of `inputs`, (member, batch, *input), and of `target`, (member, batch, *event).
+        """
         triples = zip(self._all(), inputs, target, strict=True)
         return torch.stack([model.loss(own_inputs, own_target) for model, own_inputs, own_target in triples])
 
@@ -159,7 +165,7 @@ class Apart(nn.Module):
         return [Stacked(several[first : first + self.size]) for first in range(0, len(several), self.size)]
 
     def training_densities(self, inputs: Tensor) -> list[Distribution]:
-        """Return the density of each model that an objective may shape, batch_shape (batch,)."""
+        """Return the densities that objectives read in training: one for each model, batch_shape (batch,)."""
         return [model.training_densities(inputs) for model in self._all()]
 
     def losses_of_all(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch member"]:

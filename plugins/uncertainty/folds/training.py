@@ -18,7 +18,7 @@ WARMUP = 0.02
 VALIDATIONS = 40
 """Number of times that the losses of the left-out folds are computed during training."""
 MOST_STEPS = 20_000
-"""Largest number of steps; a larger table is passed fewer times."""
+"""Largest number of steps; if there are very many samples, the training makes fewer passes than it otherwise would."""
 AT_ONCE = 8192
 """Largest number of left-out samples of a model whose losses are computed at once."""
 
@@ -43,7 +43,7 @@ class Schedule:
     most_steps: int = MOST_STEPS
 
     def count_steps(self, batches: int) -> int:
-        """Return the number of steps for a pass of `batches` batches."""
+        """Return the number of steps of the training, if one pass over the samples has `batches` batches."""
         return min(self.most_steps, max(self.steps, self.epochs * batches))
 
     def rate(self, step: int, steps: int) -> float:

@@ -28,7 +28,7 @@ Decay = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 PSEUDO = 2.0
 """Number of samples that are added to the share of each group when the weights of the groups are fitted."""
 EM_STEPS = 200
-"""Number of steps of the fit of the weights, which is flat near its end."""
+"""Number of steps of expectation maximisation that fit the weights of the groups; the last steps change little."""
 UNLIKELY = 20.0
 """Number of nats below the median log-density at which a left-out sample is reported."""
 BLOCK = 4096
@@ -98,7 +98,10 @@ class Folds(Uncertainty, SelfTraining):
         self._fold: Tensor | None = None
 
     def forward(self, inputs: Tensor) -> Distribution:
-        """Return the mixture of the densities of all models; of those that did not see a sample if `rows` is set."""
+        """Return the mixture of the densities of all models.
+
+        If `rows` is set, the mixture for a sample has only the models that did not see this sample in training.
+        """
         groups = self._groups(inputs)
         if len(groups) == 1:
             return groups[0]
@@ -184,7 +187,11 @@ class Folds(Uncertainty, SelfTraining):
 
     @torch.no_grad()
     def calibrate(self, batches: Iterable[Batch]) -> None:
-        """Calibrate the models with samples that none of them saw; samples that trained were used already."""
+        """Calibrate the models with samples that no model saw in training.
+
+        Samples of the training have the field "row". For them the method does nothing, because `train_models` has
+        already calibrated the models with them.
+        """
         calibration_batches = list(batches)
         if not any("row" in batch for batch in calibration_batches):
             self.models.calibrate(calibration_batches, None)

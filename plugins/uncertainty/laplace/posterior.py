@@ -21,7 +21,7 @@ Covariance = Literal["full", "kronecker", "diagonal"]
 DRAWS = 32
 """Number of targets per training sample that are drawn for the Fisher information, if it has no closed form."""
 LARGEST_EXPONENT = 30.0
-"""Bound on the logarithm of the precision of the prior, to both sides of 1."""
+"""Largest |log λ| of the precision λ of the prior."""
 STEPS = 80
 """Number of halvings of the interval of log λ, after which its length is below the rounding error of float64."""
 

@@ -15,7 +15,10 @@ Term = Callable[[Tensor], Tensor]
 
 RESTARTS = 20
 NEAREST = 1e-9
-"""Step, as a factor on the gradient, at which the search ends beside a region in which values are not finite."""
+"""Step, as a factor on the gradient, below which the search ends.
+
+Steps become this short beside a region in which the minimised sum is not finite.
+"""
 
 
 class Minimum(NamedTuple):
