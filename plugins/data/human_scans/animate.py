@@ -100,7 +100,14 @@ def render_animation(
 ) -> list[Image.Image]:
     """Return the frames of the animation.
 
-    The command has the same arguments; `paths` is passed to `framework.load`.
+    Args:
+        run: run of a trained renderer.
+        who: name of a test subject, or the file of a mesh; None for the first test subject.
+        file: motion file; None for a person who keeps the pose and is seen from all sides.
+        frames: number of frames.
+        start: time in the motion file at which the animation starts, s.
+        azimuth: azimuth of the camera, degrees, if there is a motion file.
+        paths: files and folders that the run's configuration names, as in `framework.load`.
     """
     description, _ = read_stored(run, paths=paths)
     data: HumanScans = training_data(description, "human_scans")

@@ -304,7 +304,7 @@ def photograph(view: View) -> tuple[Float[Tensor, "height width 3"], Float[Tenso
 def in_front(vertices: Float[Tensor, "vertices 3"], height: int, width: int) -> Camera:
     """Return an upright camera that sees the whole mesh from the front, with the lens of the canonical camera.
 
-    The front of the mesh faces along z, and y points up.
+    The front of the mesh faces along z, and y points up. The image has `height` × `width` pixels.
     """
     low, high = vertices.min(0).values, vertices.max(0).values
     middle, extent = (low + high) / 2, high - low

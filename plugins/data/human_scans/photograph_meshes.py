@@ -121,6 +121,14 @@ def write_person(
     """Write the photographs of a person's scan and the registration to a folder.
 
     The camera positions depend only on the name of the folder, which is the name of the person.
+
+    Args:
+        folder: folder of the person.
+        pair: files of the scan and of the registration.
+        topology: name of the registration's topology.
+        renderer: renderer that draws the photographs.
+        views: number of photographs.
+        size: height and width of a photograph, pixels.
     """
     scan, registration = (meshes.read(file) for file in pair)
     scan_layout.write_registration(

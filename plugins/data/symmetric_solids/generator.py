@@ -34,7 +34,7 @@ BATCH = 100
 
 
 def stream(seed: int, name: str, split: int, purpose: int) -> torch.Generator:
-    """Return the random numbers of a solid and split; `purpose` is 0 for the rotations, 1 for the labels."""
+    """Return the random generator of a solid and split; `purpose` is 0 for the rotations, 1 for the labels."""
     key = np.random.SeedSequence([seed, list(SOLIDS).index(name), split, purpose]).generate_state(1)[0]
     return torch.Generator().manual_seed(int(key))
 

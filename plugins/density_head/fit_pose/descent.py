@@ -102,7 +102,8 @@ class Descent:
     def __call__(self, picture: Float[Tensor, "height width 4"]) -> BodyFit:
         """Return the fit with the smallest difference of images among the first descent and its restarts.
 
-        The restarts are random but always the same, so that the fit depends only on the image.
+        The channels of `picture` are linear RGB on black, and the share of each pixel that the body covers. The
+        restarts are random but always the same, so that the fit depends only on the image.
         """
         began = time.process_time()
         random = torch.Generator().manual_seed(0)

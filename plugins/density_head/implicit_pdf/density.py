@@ -45,7 +45,7 @@ class CellDensity(ViewpointDensity):
 
     @property
     def mode(self) -> Float[Tensor, "*batch 3"]:
-        """Viewpoint at the centre of the most likely cell; the factor cos e of its density is not included."""
+        """Viewpoint at the centre of the most likely cell: the mode of p(R), without regard to the factor cos e."""
         best = self.log_weights.argmax(-1)
         return centres(self.cells).to(best.device)[best].to(self.log_weights.dtype)
 

@@ -68,7 +68,7 @@ class Networks(Latent):
         posterior: function from φ (*sample, *batch, *event) to q(z|x,φ) of shape (*sample, *batch, latent).
         decode: function from z (*sample, *batch, latent) to the component's raw parameters (*sample, *batch, number).
         component: function from raw parameters to p(φ|x,z).
-        rows: function from indices (rows,) into the flattened batch to the networks of these inputs.
+        rows: function from indices (rows,) of inputs in the flattened batch to the networks of these inputs alone.
         width: number of activations that one decoded z holds in memory.
         size: number of raw parameters that the component reads.
     """

@@ -71,8 +71,12 @@ class LorentzianHead(DensityHead, Fitted):
 def parameters_of(names: tuple[str, ...], by: str) -> Parameters:
     """Return the parameters of the preset (framework.spectra.spectrum) whose target has the names `names`.
 
+    Args:
+        names: names of the numbers of the target.
+        by: subject of the message, such as "density_head lorentzian".
+
     Raises:
-        ConfigError: no preset has them.
+        ConfigError: no preset has a target with these names.
     """
     for preset in PRESETS.values():
         if preset.target == names:

@@ -56,10 +56,12 @@ def exact(raw: np.ndarray, value: np.ndarray) -> float:
 
 
 def log_constant(first: float, second: float, third: float) -> float:
-    """Return log(c(F) exp(-tr S)) for λ₁, λ₂ and λ₃, by the integral of Lee 2018, eq. 12, with u = 1 - 2w.
+    """Return log(c(F) exp(-tr S)) for the falls λ₁, λ₂, λ₃, by the integral of Lee 2018, eq. 12, with u = 1 - 2w.
 
-    It is computed by Gauss-Legendre quadrature on panels that become shorter towards both ends, by a factor of ten for
-    every two panels. The components of the quaternion are paired as (q₀, q₃) and (q₁, q₂), unlike in the
+    The falls are those of `framework.geometry.aligned_rotations`, and S holds the proper singular values of F.
+
+    The integral is computed by Gauss-Legendre quadrature on panels that become shorter towards both ends, by a factor
+    of ten for every two panels. The components of the quaternion are paired as (q₀, q₃) and (q₁, q₂), unlike in the
     framework's own quadrature.
     """
     borders = np.concatenate([[0.0], np.logspace(-40, np.log10(0.5), 80)])

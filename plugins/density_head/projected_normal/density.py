@@ -73,7 +73,7 @@ class ProjectedNormal(PlainDensity):
     @cached_property
     @torch.no_grad()
     def candidates(self) -> Float[Tensor, "3 *batch angle"]:
-        """Three angles for each angle, at least one of which is its mode, float64.
+        """Three candidates for the mode of each angle's density, at least one of which is the mode, float64.
 
         The search begins at the two highest maxima on a grid, and at the direction of μ, around which a concentrated
         density has its only peak.

@@ -32,7 +32,7 @@ STEP = 0.4
 NODES = 20
 """Number of nodes of each of the two panels of the quadrature for k."""
 PANEL, REACH = 3.0, 44.0
-"""Length of the last panel in y, and exponent beyond which terms are neglected."""
+"""Length of the last panel in the variable of integration y, and exponent beyond which terms are neglected."""
 CHUNK = 2**21
 """Largest number of Bessel functions of one kind that are evaluated at once."""
 LOW, HIGH = -5.2, math.log(45 / SOFTENING**2)

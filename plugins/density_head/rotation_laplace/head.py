@@ -4,7 +4,7 @@ from framework.heads.rotations import MatrixHead
 from plugins.density_head.rotation_laplace.density import RotationLaplace
 
 LARGEST_PARAMETER = 1e6
-"""Largest Frobenius norm of A, for typical deviations of about 0.1°; float64 resolves d down to δ there."""
+"""Largest Frobenius norm of A. With this norm, typical deviations are about 0.1°, and float64 resolves d down to δ."""
 
 
 class RotationLaplaceHead(MatrixHead):

@@ -21,13 +21,13 @@ LEAST_EVIDENCE = 1e-6
 
 
 class EvidentialHead(HeadOfReals):
-    """Student's t of a normal-inverse-gamma density of mean and variance, for each input (Amini et al. 2020).
+    """Student's t density of a normal number whose mean and variance have a predicted prior (Amini et al. 2020).
 
-    For each number, the network predicts γ, ν, α and β of the density N(μ; γ, σ²/ν) Γ⁻¹(σ²; α, β) of the unknown mean μ
-    and variance σ². The density of the target without μ and σ² is Student's t with 2 α degrees of freedom, the location
-    γ and the squared scale β (1 + ν) / (ν α) (eq. 7-8), whose likelihood is trained. A penalty λ |y - γ| (2 ν + α)
-    reduces the evidence for predictions that are wrong (eq. 9-10). The aleatoric variance is β / (α - 1), and the
-    epistemic one β / (ν (α - 1)) (`evidence`).
+    For each number, the network predicts γ, ν, α and β of the prior N(μ; γ, σ²/ν) Γ⁻¹(σ²; α, β) of the unknown mean μ
+    and variance σ². Integration over μ and σ² gives the density of the target: Student's t with 2 α degrees of freedom,
+    the location γ and the squared scale β (1 + ν) / (ν α) (eq. 7-8). The head is trained by its likelihood. A penalty
+    λ |y - γ| (2 ν + α) reduces the evidence for predictions that are wrong (eq. 9-10). The aleatoric variance is
+    β / (α - 1), and the epistemic one is β / (ν (α - 1)); `evidence` returns γ, ν, α and √β.
 
     For each number, the head reads four raw parameters. The first is γ itself. ν, α - 1 and √β are the positive
     function `scale_of_raw` of the other three. If `Target` has the mean and the standard deviations of the training

@@ -25,9 +25,10 @@ FREEDOMS = (3.0, 4.0, 5.0, 7.0, 10.0, 15.0, 30.0, NORMAL)
 LOG_FACTORS = torch.linspace(-1.4, 1.0, 25, dtype=torch.float64)
 """Logarithms of the factors on the scale from which `calibrate` chooses; one of them is 0."""
 FACTOR_PRIOR, FREEDOM_PRIOR = 2.5, 0.5
-"""Weights of ln² of the factor and of ln(30/ν), nats, which `calibrate` subtracts from the log-likelihood.
+"""Weights, nats, of the penalties that `calibrate` subtracts from the log-likelihood.
 
-With few samples, the factor stays near 1 and the density near a normal one.
+The penalties are ln² of the factor and, for ν below 30, ln(30/ν). With few samples, the factor
+therefore stays near 1 and the density near a normal one.
 """
 
 

@@ -41,7 +41,10 @@ def half_products(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def in_single(value: Tensor, mean: Tensor) -> bool:
-    """Return whether to compute in float32 alone: both angles are float32, and code may read their values."""
+    """Return whether to compute in float32 alone.
+
+    This is so if both angles are float32 and their values can be read, which compilers and torch.func do not allow.
+    """
     if torch.compiler.is_compiling() or is_transformed():
         return False
     return value.dtype == mean.dtype == torch.float32
@@ -54,7 +57,7 @@ def _half_angle_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def parts_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return sin(d/2), cos(d/2), sin(e/2) and cos(e/2) for the rounded difference d of φ-μ and its rounding error e.
+    """Return sin(d/2), cos(d/2), sin(e/2) and cos(e/2), where d is φ-μ rounded to float32, and e the rounding error.
 
     This takes fewer operations than `_reduce`, because float32's sine and cosine are also exact for large angles.
     """

@@ -42,9 +42,8 @@ def kl_divergence(
 def cdf(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
     """Return the probability of the arc from mean - π to `value`; each further full rotation of `value` adds 1.
 
-    The convention is SciPy's. Quadrature in float64 has an absolute error below 1e-15; the relative error of the lower
-    tail is below 4e-15 times the greater of 1 and its logarithm. The result is differentiable, once, in all three
-    arguments.
+    The convention is SciPy's. Quadrature in float64 has an absolute error below 1e-15. A probability P in the lower
+    tail has a relative error below 4e-15 · max(1, |log P|). The result is differentiable, once, in all three arguments.
     """
     dtype = torch.promote_types(torch.promote_types(value.dtype, mean.dtype), concentration.dtype)
     wide = (argument.double() for argument in (value, mean, concentration))

@@ -29,7 +29,19 @@ def render(
     channels: tuple[str, ...],
     cull: bool,
 ) -> dict[str, Tensor]:
-    """Draw the channels of an image; `pose` is rotation, translation and lens (fx, fy, cx, cy), float64."""
+    """Draw the channels of an image.
+
+    Args:
+        vertices: (vertices, 3), world coordinates, metres.
+        faces: (faces, 3), indices of vertices.
+        colors: (vertices, channels), linear RGB; None without vertex colours.
+        texture: texture of the faces, or None.
+        pose: rotation, translation and lens (fx, fy, cx, cy), float64.
+        near: distance of the near plane, metres.
+        size: height and width of the image, pixels.
+        channels: names of the channels.
+        cull: leave out faces seen from behind.
+    """
     rotation, translation, lens = pose
     faces = faces.long()
     camera_points = vertices.double() @ rotation.double().T + translation.double()

@@ -79,7 +79,10 @@ class RankOne(nn.Module):
 
 
 def replace_layers(module: nn.Module, members: int, spread: float) -> int:
-    """Replace all layers of the classes LAYERS inside a module, in place, and return their number."""
+    """Replace all layers of the classes LAYERS inside a module by `RankOne` layers; return the number of these layers.
+
+    The module is changed in place. `members` and `spread` are as in `RankOne`.
+    """
     count = 0
     for name, child in list(module.named_children()):
         if isinstance(child, LAYERS):
