@@ -39,7 +39,7 @@ class Predictor(nn.Module, ABC):
         """Return the densities that an objective may shape by gradient.
 
         Their batch_shape is (batch,), or (batch, member) if several members are trained. A model returns its own
-        density. A wrapper returns the densities of what it wraps, before it mixes or calibrates them.
+        density. A wrapper returns the densities of the wrapped models, before it mixes or calibrates them.
         """
 
     @abstractmethod

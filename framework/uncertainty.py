@@ -156,8 +156,9 @@ def held_out(predictor: Predictor, batch: Batch) -> Iterator[None]:
 class FollowsTraining(ABC):
     """Additional base class of a wrapper that reads the weights while they are trained, such as an average of weights.
 
-    What it collects are buffers, so that checkpoints store it, and a resumed training continues with it. The weights of
-    the last epoch must be kept (trainer.keep=last), and training must not stop early (trainer.patience=null).
+    The wrapper keeps the collected numbers in buffers, so that checkpoints store them, and a resumed training continues
+    with them. The weights of the last epoch must be kept (trainer.keep=last), and training must not stop early
+    (trainer.patience=null).
     """
 
     @abstractmethod

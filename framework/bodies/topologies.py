@@ -187,9 +187,9 @@ def recognise_topology(
 def body_in_topology(body: Body, surface: Sheet, mesh: Topology) -> Body:
     """Return a body model whose vertices are those of the topology `mesh`; it has no texture coordinates.
 
-    `surface` is the sheet of the topology. Vertices that the body has too keep their template, shapes and skinning
-    weights. At the midpoint of an edge these are the means over both ends. Where the surface is bent by the pose, the
-    skinned midpoint is therefore not exactly the middle of the posed edge.
+    `surface` is the sheet of the topology. A vertex of the body keeps its template position, its displacements by shape
+    and its skinning weights. A new vertex, at the midpoint of an edge, has the means over both ends of the edge. Where
+    the pose bends the surface, the skinned midpoint is therefore not exactly the middle of the posed edge.
     """
     parts = {
         part: surface.interpolate(getattr(body, part))[mesh.rows]

@@ -1,4 +1,4 @@
-"""Inverse linear blend skinning: takes a registered mesh back to the rest pose (thesis §7.4.3).
+"""Inverse linear blend skinning, which moves the vertices of a registered mesh to the rest pose (thesis §7.4.3).
 
 The thesis computes a template of every subject, W⁻¹(X) - B_P(θ): its mesh X without skinning W and without the pose
 blend shapes B_P. Here this template is written as the model's template plus offsets. The model with these offsets then

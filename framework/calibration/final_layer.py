@@ -1,4 +1,4 @@
-"""The final linear layer of a model, in front of its density head: finding it, and what it reads and returns."""
+"""Functions that find the final linear layer of a model, before the density head, and return its input and output."""
 
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ class FinalLayerPass(NamedTuple):
     Attributes:
         features: input of the layer.
         raw: output of the layer, the raw parameters.
-        density: density of the prediction; None for a `Model`, whose head need not run.
+        density: density of the prediction; None if the predictor is a `Model`, whose head is not called.
     """
 
     features: Float[Tensor, "batch feature"]

@@ -111,7 +111,7 @@ def collect(
         classes: Names of the classes.
         folders_of_class: The folders, each with the name of its class and of its split: (class, split, folder).
         suffixes: Suffixes of the files to return, in small letters.
-        kind: Name of such a file in messages.
+        kind: Name of a file with one of these suffixes, for messages.
         remedy: Advice in messages.
     """
     files, labels, splits, ignored = [], [], [], 0

@@ -302,7 +302,7 @@ class ModelNoise:
 
 
 def multiple_of_batch(size: str) -> int:
-    """Return the factor of the number of inputs in such a text: 50 for "50 * batch"."""
+    """Return the factor in a length of `ModelNoise.shape` that is a text: 50 for "50 * batch"."""
     return int(size.partition(" ")[0])
 
 

@@ -8,7 +8,7 @@ from framework.distributions.circular import Circular, wrap
 from framework.distributions.protocol import QuadraticBound, quadratic_bound
 
 STARTS = 3
-"""Number of starting points from which the search begins: those at which the density is highest."""
+"""Number of starting points from which the search goes uphill; the density is higher at these than at the others."""
 STEPS = 16
 """Largest number of steps from one starting point."""
 LONGEST = 16.0

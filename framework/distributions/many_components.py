@@ -44,7 +44,7 @@ def likeliest_modes(
 
     Args:
         components: a density of one number with batch_shape (*batch, K), with K modes for each item of the batch. If
-            its `quadratic_bound` is unknown, its smoothness is too, and the result is None.
+            its `quadratic_bound` is not known, its smoothness is not known either, and the result is None.
         log_weights: logarithms of the weights, nats.
         modes: mode of each component.
     """

@@ -217,7 +217,9 @@ class Density:
         return np.stack([find(part) for part in parts], -1)
 
     def interval(self, mass: float) -> Interval:
-        """Return the central interval of probability `mass` of each number; half of the rest lies beyond each end.
+        """Return the central interval of each number, with probability `mass`.
+
+        Half of the remaining probability lies beyond each end.
 
         For angles, `low` is in [-π, π), and the median splits the arc into two parts of equal probability.
         """

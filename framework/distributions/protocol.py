@@ -114,7 +114,7 @@ class _Picked(Distribution):
 def recentre(density: Distribution, index: tuple[Tensor, ...], origin: Tensor) -> Distribution:
     """Return the density of X - origin, in float64, so that values near the origin keep their digits.
 
-    X has the density number `index` of the batch. Only `log_prob` of the returned density is used.
+    X is a random number with the density at `index` of the batch. Only `log_prob` of the returned density is used.
     Default: the origin is added to each value, and the sum is rounded to the density's number type. A density with a
     location registers a function that subtracts the origin from the location: then no rounding limits how narrow the
     density may be.

@@ -150,7 +150,7 @@ def evaluate_frames(
 
     Args:
         painter: renderer and background; its channels include those that the metrics read.
-        blocks: frames; those of a block are drawn together.
+        blocks: groups of frames; the frames of a group are drawn together.
         metrics: metrics to compute; they are copied.
         groups: names of the groups.
         keep: function that is called with each frame and its channels, for example to write them to a file.

@@ -77,8 +77,8 @@ def least_significant(means: Sequence[Mean]) -> Float[np.ndarray, "means means"]
     The smallest significant difference is the quantile of Student's t times the standard error of the difference, with
     the degrees of freedom of B. L. Welch (1947), "The generalization of 'Student's' problem when several different
     population variances are involved", Biometrika 34, 28-35. It is NaN if a standard error is not known, or if one
-    standard error was computed over runs and the other over the samples of a single run, which does not include the
-    differences between runs.
+    standard error was computed over runs and the other over the samples of a single run: the latter does not include
+    the differences between runs.
     """
     from scipy.special import stdtrit
 

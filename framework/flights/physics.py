@@ -1,8 +1,9 @@
 """The physics of a table-tennis ball: flight with drag, Magnus force and spin decay, and its bounce.
 
 Formulas are written over single components with arithmetic only, so that they serve both plain floats and batches of
-tensors. SciPy's solvers call them with floats a hundred thousand times; the type checks that tests switch on would take
-too long. The estimation calls them with tensors. Units: metres, seconds, rad/s; z is up; y runs along the table.
+tensors. The estimation calls them with tensors, and SciPy's solvers call them with floats a hundred thousand times.
+Therefore `no_type_check` excludes them from the type checks that tests switch on. Units are metres, seconds and rad/s;
+z points up, and y along the table.
 """
 
 from dataclasses import dataclass

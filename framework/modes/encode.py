@@ -47,7 +47,7 @@ class EncodeOptions(Options):
         files: Folder of the files, or folder of shards.
         into: Folder for the features.
         part: Number of files in a part.
-        share: Share of the parts that this job computes.
+        share: Share of the parts that this job computes, such as "2/4": every fourth part, from the second on.
         pack: Whether to write the inputs themselves, as shards.
     """
 

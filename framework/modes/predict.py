@@ -157,10 +157,11 @@ def predictions(
 ) -> tuple[dict[str, list[str]], list[tuple[Tensor, Tensor]]]:
     """Return the columns of the CSV table by name, and the tensors from which the data set draws maps.
 
-    A row has the name of a sample, the point prediction, the density's entropy in nats and the prediction set, or, if
-    the model predicts no sets, the interval of probability `mass`. Standard errors are included if the ends of
-    intervals are estimated from random values. If the data set draws maps of `files`, the tensors are, for each
-    batch, the point predictions and the standard deviations, each (batch, number); otherwise there are no tensors.
+    A row has the name of a sample, the point prediction, the entropy of the density in nats, and the prediction set. If
+    the model predicts no sets, the row has the interval of probability `mass` instead; None leaves it out. The row also
+    has the standard errors of the interval's ends if these are estimated from random values. If the data set draws maps
+    of `files`, the tensors are, for each batch, the point predictions and the standard deviations, each (batch,
+    number); otherwise there are no tensors.
 
     Predicted images are written to the folder `images`, and the row contains the name of the image file. `examine` is
     called with the first batch.

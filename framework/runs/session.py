@@ -446,8 +446,8 @@ def _first_samples(dataset: Dataset[Batch], most: int) -> Batch:
 def for_trained(config: Config, *, prepare: bool = True) -> Session:
     """Return the session of the trained model that the setting `checkpoint` names.
 
-    Data, outliers and metrics are those that the command line chooses; groups that it does not choose are those of the
-    model. If `prepare` is False, the data set generates and loads no data, and can only read the user's own files.
+    The command line may choose data, outliers and metrics; those that it does not choose are taken from the model's own
+    run. If `prepare` is False, the data set generates and loads no data, and can only read the user's own files.
 
     Raises:
         ConfigError: The command names no checkpoint.

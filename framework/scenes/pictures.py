@@ -125,7 +125,8 @@ def color_image(
     """Return the 8-bit sRGB image of linear RGB and coverage.
 
     Args:
-        rendered: linear RGB, multiplied by coverage, and coverage.
+        rendered: linear RGB multiplied by the coverage, and as fourth channel the coverage, which is the share of each
+            pixel that the scene covers.
         background: sRGB colour behind the scene; None for a transparent background, with alpha as fourth channel.
     """
     light, covered = rendered[..., :-1], rendered[..., -1:].clamp(0, 1)

@@ -33,8 +33,11 @@ as in `subprocess.Popen`; null until the job has ended for good) and reason (wha
 not say it).
 """
 STOP = signal.SIGUSR1
-"""Signal that asks a job to stop. The processes of the job itself ignore it, because some clusters send a signal to all
-processes, and a job that receives two signals does not wait for the end of its batch."""
+"""Signal by which the cluster asks for the end of a job.
+
+The process that receives it sends SIGTERM to the job's command once. The processes of the command ignore STOP, because
+some clusters send it to all processes, and a run that receives two signals does not wait for the end of its batch.
+"""
 PATIENCE = 0.1
 """Seconds between two attempts to acquire the lock, and between two looks at the command."""
 

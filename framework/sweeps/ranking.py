@@ -37,8 +37,8 @@ class Trial:
         value: Number that the job returned; None if it returned none.
         completed: Whether the job has completed.
         note: Why a trial that has not completed has no value.
-        study_values: Value of each metric, with the sign that makes lower values better, for a job whose folder another
-            machine has.
+        study_values: For a job whose folder is on another machine, the value of each metric, with the sign that makes
+            lower values better; None for any other job.
     """
 
     folder: Path

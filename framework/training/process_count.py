@@ -30,10 +30,10 @@ class Launched:
 
 
 def require_processes(trainer: Mapping[str, Any]) -> None:
-    """Refuse a training whose processes are not those that `trainer.devices` and `trainer.num_nodes` name.
+    """Refuse a training if the number of its processes does not fit `trainer.devices` and `trainer.num_nodes`.
 
-    Without this check such a training waits for processes that nobody starts, or ends with an error from the middle of
-    Lightning. Nothing is checked if this process trains alone or starts the other processes itself.
+    Without this check, the training would wait for processes that nobody starts, or end with an error of Lightning that
+    does not name the cause. Nothing is checked if this process trains alone or starts the other processes itself.
 
     Args:
         trainer: Settings of the trainer.

@@ -77,7 +77,7 @@ class Model:
         return build(self.description["density"], self.parameters(inputs, seed), self._families)
 
     def parameters(self, inputs: Any, seed: int = 0) -> dict[str, NDArray[Any]]:
-        """Return the parameters of the densities by name; arguments and errors are those of a call."""
+        """Return the parameters of the densities by name; arguments and errors are those of a call of the model."""
         array = self._array(inputs)
         at_once = max(1, MOST_POINTS // max(1, array.shape[1])) if self._cloud else max(1, len(array))
         parts = [array[start : start + at_once] for start in range(0, len(array), at_once)] or [array]

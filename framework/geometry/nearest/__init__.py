@@ -302,8 +302,8 @@ def on_device(clouds: Tensor, points: Tensor, sizes: Tensor | None, query_sizes:
 def scaling(cloud: Tensor, queries: Tensor) -> float:
     """Return a power of two that scales the largest coordinate of a cloud and its queries to about 1.
 
-    Multiplying by a power of two is exact. If the dtype cannot hold the power that is needed, the closest power within
-    2^±MOST is returned, and `nearest` scales again.
+    Multiplying by a power of two is exact. If the required exponent is too large for the dtype (`exponents.MOST`), the
+    closest allowed power is returned, and `nearest` scales again.
     """
     largest = max(float(cloud.abs().max()), float(queries.abs().max()))
     return 2.0 ** max(-MOST[cloud.dtype], min(MOST[cloud.dtype], -math.frexp(largest)[1]))
