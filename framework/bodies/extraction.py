@@ -74,7 +74,10 @@ def extract(scratch: Path) -> tuple[Body, dict[str, np.ndarray]]:
 
 @torch.no_grad()
 def largest_distance(model: anny.Anny, body: Body) -> float:
-    """Return the largest distance, metres, between a vertex and the same vertex by `anny`, over eight random bodies."""
+    """Return the largest distance, metres, between vertices of `body` and the same vertices of `anny`'s model.
+
+    Eight random bodies are compared.
+    """
     random = np.random.default_rng(0)
     count, joints = 8, len(body.parents)
     traits = {label: torch.from_numpy(random.random(count)) for label in model.phenotype_labels}

@@ -1,7 +1,7 @@
 """Random poses within plausible limits, and the joints of a body that each movement rotates.
 
 Movements are angles in degrees that mean the same for every body in any rest pose: an arm raised by 90° is horizontal,
-an elbow bent by 0° is straight. Axes: x to the body's left, y up, z to the front.
+an elbow bent by 0° is straight. The x axis points to the body's left, y up and z to the front.
 """
 
 from collections.abc import Sequence

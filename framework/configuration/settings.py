@@ -116,7 +116,7 @@ class LoggerSettings(_Strict):
     """
     experiment: str | None = None
     copies: list[Literal["csv", "tensorboard", "wandb"]] = []
-    """Further formats in which the numbers are written into the run folder."""
+    """Further formats in which the numbers of a run are written to files on this machine."""
 
 
 class BudgetSettings(_Strict):
@@ -281,11 +281,15 @@ class Settings(_Strict):
 def store_experiment(config: Mapping[str, Any], trained_on: str = "") -> str:
     """Return the name of the experiment to which a run belongs in the tracking store.
 
-    The name is `logger.experiment`, if it is set. Otherwise it is the part of `experiment=` before the slash, such as
-    "moons" for `experiment=moons/scvae`; without an experiment, it is the name of the data set; without a data set, it
-    is `trained_on`, the data set on which the stored model was trained. If there is none of these, it is "Default", the
-    experiment that MLflow creates itself. All methods on the same data share one experiment, so that the runs of a
-    sweep over methods appear under their parent and can be compared.
+    The name is the first of these that exists:
+    - `logger.experiment`;
+    - the part of `experiment=` before the slash, such as "moons" for `experiment=moons/scvae`;
+    - the name of the data set;
+    - `trained_on`, the data set on which the stored model was trained;
+    - "Default", the experiment that MLflow creates itself.
+
+    All methods on the same data share one experiment, so that the runs of a sweep over methods appear under their
+    parent and can be compared.
     """
     logger = config.get("logger") or {}
     name = config.get("experiment_name")

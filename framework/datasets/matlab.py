@@ -2,7 +2,7 @@
 
 SciPy's reader is not used, because a file with one wrong byte can crash the process (observed with SciPy 1.17). Before
 memory is allocated, every element must lie within its parent element and hold as much data as its dimensions state.
-The format: MathWorks, MAT-File Format (R2023b).
+The source of the format is MathWorks, "MAT-File Format" (R2023b).
 """
 
 import math

@@ -2,8 +2,8 @@
 
 The folder holds the network, from the user's arrays to the parameters of the density, as `model.onnx`; the family of
 the density, its target and its calibration as `density.json`; and Python files that compute densities and predictions
-(`framework/deployment/exported_folder`). The network is traced by torch.export. What it computes is compared with the
-original model on random and extreme inputs, and nothing is written if they differ.
+(`framework/deployment/exported_folder`). The network is traced by torch.export. Its outputs are compared with those of
+the original model on random and extreme inputs, and nothing is written if they differ.
 """
 
 import copy
@@ -132,8 +132,8 @@ class Exporting:
     def accepted_arrays(self, count: int, spread: float) -> Tensor:
         """Return random arrays that the model accepts.
 
-        An encoder may require that point clouds lie in the unit ball. In extreme ones, every point is one of the eight
-        corners of a cube in this ball, so that most points are equal.
+        An encoder may refuse random point clouds, because they are not in the unit ball. Every point is then moved to
+        one of the eight corners of a cube in this ball, so that most points are equal.
         """
         arrays = self.arrays(count, spread, seed=count)
         if self.cloud:

@@ -38,7 +38,7 @@ def load(
 
     With a budget, such as `{"milliseconds": 5}`, the settings of the model that trade error for run time (samples,
     members, steps) are measured on this machine with the validation data of the run, and set to the cheapest values
-    that meet the budget. `print(model)` then says which, and why.
+    that meet the budget. `print(model)` then shows these values and the reason for them.
 
     Args:
         run_or_checkpoint: A run folder (`outputs/...`), a `.ckpt` file, or an MLflow run id.

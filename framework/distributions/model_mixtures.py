@@ -12,9 +12,10 @@ from framework.distributions.density import Mixture
 def expected_entropy(density: Distribution) -> Float[Tensor, "*batch"]:
     """Return the mean entropy of the models of a mixture over models (`Mixture.over_models`), nats, (*batch).
 
-    It is the aleatoric part of the entropy, which remains if the model is known. The entropy of the mixture minus it is
-    the mutual information of target and model, the epistemic part (Depeweg et al. 2018). Mixtures of mixtures over
-    models are divided down to single models. For any other density, which is one model, it is the entropy.
+    This mean is the aleatoric part of the entropy, which remains if the model is known. The rest of the mixture's
+    entropy is the mutual information of target and model, the epistemic part (Depeweg et al. 2018). Mixtures of
+    mixtures over models are divided down to single models. Any other density comes from one model, and the result is
+    its entropy.
     """
     if isinstance(density, Mixture):
         single = density.log_weights.shape[-1] == 1

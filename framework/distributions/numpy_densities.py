@@ -153,7 +153,7 @@ class Density:
         """Return the densities that `index` chooses along one batch dimension.
 
         Args:
-            index: (*batch up to the dimension `axis`, count).
+            index: indices along the batch dimension `axis`, (*batch before this dimension, count).
             axis: number of the batch dimension.
         """
         chosen = copy.copy(self)
@@ -418,8 +418,8 @@ def wrap(angle: Array) -> Array:
 def half_circle_rule(concentration: Array, angle: Array) -> tuple[Array, Array]:
     """Return points and weights of a Gauss-Legendre rule for integrals over θ from 0 to `angle`.
 
-    The rule is for integrands with the factor exp(κ (cos θ - 1)). The weights do not contain this factor. There are no
-    points where it is below exp(-40).
+    The rule is for integrands with the factor exp(κ (cos θ - 1)), where κ is `concentration`. The weights do not
+    contain this factor, and no points are placed where it is below exp(-40).
     """
     sine = np.sqrt(_LEAST / 2 / np.maximum(concentration, _LEAST / 2))  # κ (1 - cos θ) = 2 κ sin²(θ/2)
     end = np.minimum(angle, 2 * np.arcsin(sine))
@@ -428,7 +428,7 @@ def half_circle_rule(concentration: Array, angle: Array) -> tuple[Array, Array]:
 
 
 def half_circle(concentration: Array, angle: Array) -> Array:
-    """Return ∫ exp(κ (cos θ - 1)) dθ from 0 to `angle` in [0, π]."""
+    """Return ∫ exp(κ (cos θ - 1)) dθ from 0 to `angle` in [0, π]; κ is `concentration`."""
     points, weights = half_circle_rule(concentration, angle)
     return (weights * np.exp(-2 * concentration * np.sin(points / 2) ** 2)).sum(0)
 

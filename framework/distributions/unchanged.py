@@ -60,8 +60,8 @@ def outlier_score(density: Distribution) -> Float[Tensor, "*batch"] | None:
 
     A score is high for inputs unlike the training data. Its unit depends on the wrapper that computes it; only the
     order of scores has a meaning. Default: None. A mixture, a power or a marginal of a density with a score has none;
-    an affine transform has that of the density. A density that leaves another unchanged registers a function that
-    returns the score of this other density.
+    an affine transform of a density has the score of this density. A density that leaves another unchanged registers a
+    function that returns the score of this other density.
     """
     return None
 

@@ -22,8 +22,8 @@ class Cost:
         milliseconds_per_sample: median wall time of a batch divided by its size.
         latency_milliseconds: median wall time of a batch of one.
         flops_per_sample: floating-point operations of matrix products, convolutions and attention; one multiply-add
-            counts as two. Not counted are element-wise and special functions, normalisation, pooling, sorting, random
-            numbers, compiled graphs, and everything outside torch. So 0 means that no operation of a counted kind ran,
+            counts as two. Element-wise and special functions, normalisation, pooling, sorting, random numbers, compiled
+            graphs, and everything outside torch are not counted. So 0 means that no operation of a counted kind ran,
             not that the prediction took no time. None if `parameters` is None.
         parameters: number of parameters of the predictor, as the caller counted them. None if the predictor
             does not compute with torch (trees); then neither parameters nor FLOPs can be counted.

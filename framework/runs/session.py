@@ -77,7 +77,7 @@ if TYPE_CHECKING:  # a metric imports torchmetrics, which predictions do not nee
     from framework.metric import Metric
 
 FEW = 8
-"""Number of validation samples with which uncertainty wrappers are tried before training; some need more than one."""
+"""Number of validation samples with which wrappers are tried before training; some wrappers need several samples."""
 MOST_COMPARED = 1024
 """Largest number of the user's samples that are read twice to find out whether a setting of the data has an effect."""
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # constants of malloc.h

@@ -1,8 +1,8 @@
 """Reader of glTF 2.0 (Khronos, 2021) files, .gltf and .glb: surfaces, base colours and positions.
 
 Other material properties, animations, lights and cameras are not read.
-Why not trimesh: for 70 of 124 valid test files it gives another scene or none (trimesh 5.2.0;
-see docs/reference/files.md).
+The package trimesh is not used, because it reads 70 of 124 valid test files as another scene or not at all (version
+5.2.0; see docs/reference/files.md).
 """
 
 from collections.abc import Iterable, Iterator

@@ -2,8 +2,8 @@
 
 The file may be damaged or malicious: all its numbers are checked against bounds, and the size of every array is limited
 by the size of the file.
-Why not trimesh: it bounds neither memory nor time; a crafted file of 2 kB asks for 11 GiB (5.2.0;
-see docs/reference/files.md).
+The package trimesh is not used, because it bounds neither memory nor time: for a crafted file of 2 kB it requests
+11 GiB (version 5.2.0; see docs/reference/files.md).
 """
 
 import base64

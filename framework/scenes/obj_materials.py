@@ -1,7 +1,7 @@
 """Reader of colours in Wavefront OBJ files: texture coordinates, and materials of an MTL file beside the OBJ file.
 
-Why not trimesh: for 104 of 126 valid test files it gives another scene or none, and it reads 42 of 46 wrong files
-without an error (trimesh 5.2.0; see docs/reference/files.md).
+The package trimesh is not used, because it reads 104 of 126 valid test files as another scene or not at all, and 42 of
+46 wrong files without an error (version 5.2.0; see docs/reference/files.md).
 """
 
 from dataclasses import dataclass, field

@@ -1,8 +1,8 @@
 """torchmetrics, imported without Matplotlib and SciPy's signal processing.
 
-The import of torchmetrics loads both, which takes three times as long as its own modules, and the framework uses
-neither: Matplotlib serves torchmetrics' method `plot`, and SciPy's module gets an old name for a metric of speech. Here
-`plot` imports Matplotlib when it is called.
+The import of torchmetrics loads both, which takes three times as long as loading its own modules. torchmetrics needs
+Matplotlib only for its method `plot`, and SciPy's module only for a metric of speech. The framework uses neither. With
+this module, `plot` imports Matplotlib when it is called.
 """
 
 import sys

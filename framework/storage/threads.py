@@ -9,8 +9,9 @@ def wait_passively() -> None:
     """Make OpenMP threads sleep between two parallel operations; call this before torch is imported.
 
     By default, waiting threads spin. If another process uses one of the cores, a thread may spin while it waits for a
-    thread that does not run. A training with two threads then took several times the processor time and the wall time
-    of one thread. Values that the user set in OMP_WAIT_POLICY or GOMP_SPINCOUNT are not changed.
+    thread that does not run. A training with two threads then took several times as much processor time, and several
+    times as much wall time, as a training with one thread. Values that the user set in OMP_WAIT_POLICY or
+    GOMP_SPINCOUNT are not changed.
     """
     if "GOMP_SPINCOUNT" not in os.environ:
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

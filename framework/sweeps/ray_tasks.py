@@ -1,7 +1,7 @@
 """Engine that runs the jobs of a sweep as tasks of Ray, on an existing cluster or on a local one.
 
 A task ends with the command that started it, so the jobs do not outlive the command. Tasks are never retried by Ray:
-the sweep starts a job again if its node failed, after the processes of the old one have released the job's folder.
+the sweep starts a job again if its node failed, after the earlier processes of the job have released the job's folder.
 """
 
 import logging

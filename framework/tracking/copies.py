@@ -1,7 +1,7 @@
 """Further formats in which the numbers of a run are written beside its journal: CSV, TensorBoard, Weights & Biases.
 
-Nothing leaves the machine by default. Weights & Biases writes its files into the run folder and sends nothing
-(`WANDB_MODE=offline`), unless the user sets WANDB_MODE.
+Nothing leaves the machine by default. Files of CSV and TensorBoard are in the run folder. Weights & Biases writes its
+files below `outputs`, and sends nothing (`WANDB_MODE=offline`) unless the user sets WANDB_MODE.
 """
 
 import csv

@@ -11,7 +11,10 @@ INTERACTIVE = ("bash", "interactive")
 """Names of SLURM jobs in which Lightning starts the processes itself, because a person types the commands."""
 
 OTHER_LAUNCHERS = ("MASTER_ADDR", "LSB_JOBID", "OMPI_COMM_WORLD_SIZE", "PMI_SIZE")
-"""Environment variables of which one is set if a person or a launcher other than torchrun and srun starts the nodes."""
+"""Environment variables that show that the processes on all nodes are started by hand or by another launcher.
+
+At least one of them is set in this case. Other launchers are those except torchrun and srun.
+"""
 
 
 @dataclass(frozen=True)
