@@ -34,8 +34,8 @@ def require_rotation(target: Target, by: str) -> None:
 def grown_matrix(raw: Float[Tensor, "*batch 3 3"], largest: float) -> Float[Tensor, "*batch 3 3"]:
     """Return F = X (1 + |X|²/16)^(3/2) for the raw matrix X, float64, at most `largest` in the Frobenius norm |F|.
 
-    F is about X near 0, and |F| grows with the fourth power: |X| = 27 already gives |F| = 1e4, and no gradient explodes.
-    The function is smooth at 0, since it reads only |X|².
+    F is about X near 0, and |F| grows with the fourth power of |X|: |X| = 27 already gives |F| = 1e4, and no gradient
+    explodes. The function is smooth at 0, since it reads only |X|².
     """
     raw = raw.double().clamp(-1e100, 1e100)  # so that squares do not overflow
     square = raw.square().sum((-2, -1), keepdim=True)
