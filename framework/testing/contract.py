@@ -67,9 +67,9 @@ def contract(group: str, name: str, config: Mapping[str, Any] | None = None) -> 
     """Return the contract rows of the plugin `name`; if no row has the configuration `config`, a row for it is added.
 
     No row is added if `config` is None, or if it equals the configuration of a shipped row or the defaults. If the
-    plugin ships rows, the added row is a copy of one of them with the parameters of `config`. The copied row is one
-    whose nested plugins have the same names as in `config` or, if there is no such row, the first row whose target the
-    configured plugin accepts. The copy keeps the target and the properties that are left out, but not the reference
+    plugin ships rows, the added row is a copy of one of them with the parameters of `config`. A row whose nested
+    plugins have the same names as in `config` is copied; if there is none, the first row whose target the configured
+    plugin accepts is copied. The copy keeps the target and the properties that are left out, but not the reference
     cases. If the plugin ships no rows, rows are made for the default targets or input shapes. Data sets use
     `configured_row`.
 

@@ -452,9 +452,9 @@ def mode_is_highest(density: Distribution, worst: Worst) -> None:
 def mode_of_mixture(density: Distribution, worst: Worst) -> None:
     """Check that no draw and no node of the quadrature has a higher density than the mode of a mixture.
 
-    The density at the mode may be too low by 0.05 nats for classes, and for densities with a known `quadratic_bound`,
-    with which the search for the mode climbs from the modes of the components. For other densities it may be too low by
-    log 2 nats. The error is divided by the number of nats that is allowed.
+    An error of 0.05 nats is allowed for classes, and for densities with a known `quadratic_bound`, with which the
+    search for the mode can climb from the modes of the components. For other densities, log 2 nats are allowed. The
+    recorded error is divided by the allowed error.
     """
     known = density.has_enumerate_support or quadratic_bound(density, density.mode) is not None
     inner = Worst()

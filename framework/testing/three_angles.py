@@ -30,8 +30,9 @@ def cells_of_three_angles(density: Distribution, count: int) -> tuple[list[Tenso
     """Return the borders of equal cells along each angle, (count + 1,), and their masses (*cells, *batch), float64.
 
     The cells are the first boxes. A box that contains the mode is split at the mode, so that a density with a kink or a
-    sharp tip there is smooth in every box. Then the boxes are split in which the two rules differ most, each across the
-    axis along which the density is roughest, until the differences sum up to less than TOLERANCE.
+    sharp tip there is smooth in every box. Then the boxes in which the two rules differ most are split, until the
+    differences of all boxes sum up to less than TOLERANCE. A box is split across the axis along which the density is
+    roughest.
 
     Args:
         density: Density of three angles, with or without ranges.

@@ -221,9 +221,9 @@ class CEST(Data, Mapped):
         """Return a batch with random noise, and with fitted lines that are shifted along the offsets at random.
 
         The shift imitates an error of the B0 field. A spectrum is the sum of its fitted lines and of the residuals of
-        the fit; the residuals are not shifted. The shift and the standard deviation of the noise are their largest
-        values times the cube of a uniform random number, so that most spectra stay nearly unchanged and some change
-        strongly.
+        the fit; the residuals are not shifted. For each spectrum, the largest shift and the largest standard deviation
+        of the noise are multiplied by the cube of a uniform random number. Most spectra therefore stay nearly
+        unchanged, and some change strongly.
         """
         spectra, target, lines = batch["input"], batch["target"], batch["lines"]
         if self.shift:

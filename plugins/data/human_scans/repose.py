@@ -1,8 +1,9 @@
 """`python -m plugins.data.human_scans.repose <registration> ... --out <folder>` changes the pose and shape of people.
 
 A registration is a mesh with vertex colours in one of the body's topologies, or a subject's folder of `human_scans`.
-The command finds its pose and shape, takes it back to the rest pose, and writes it in each requested pose and shape,
-with cameras, so that a trained renderer can draw it (thesis Figures 7.4 and 7.5):
+The command finds the pose and the shape of a registration, and takes the mesh back to the rest pose. It then writes the
+mesh in each requested pose and shape, with cameras, so that a trained renderer can draw it (thesis Figures 7.4 and
+7.5):
 
     python -m framework mode=predict checkpoint=<run> mode.files=<folder>
 

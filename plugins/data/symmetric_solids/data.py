@@ -48,8 +48,9 @@ class SymmetricSolids(Data):
     """Grey images of symmetric solids in uniformly random rotations, with labels of known density; generated.
 
     The images are those of SYMSOL I (Murphy et al. 2021), drawn small. An image shows the rotation R of its solid only
-    up to the group G of rotations that leave the solid unchanged. The label of an image is R g N, with g uniform in G
-    and N a random rotation of known density, so that its exact density given the image is known.
+    up to the group G of rotations that leave the solid unchanged. The label of an image is R g N, where g is drawn
+    uniformly from G, and N is a random rotation of known density. The exact density of the label given the image is
+    therefore known.
 
     Further fields of a batch are "symmetry_group" (int64, an index into `framework.geometry.symmetry.GROUPS`),
     "true_rotation" (float64, (batch, 4), the quaternion of R) and, if labels are noisy, "true_log_density" (float64,

@@ -33,10 +33,11 @@ class FitPoseHead(DensityHead, Fitted):
 
     The descent (plugins.density_head.fit_pose.descent) starts from the nominal pose. The head reads images of
     `data=pose_from_image` unchanged, without an encoder. The density is normal, with the end of the descent as its
-    mean. `calibrate` sets its standard deviations to the root mean square errors on the validation split, separately
-    for fits whose image agrees with the input to within `enough` and for the other fits. Before calibration, and for
-    inputs that are not images of a body (numbers outside [0, 1], or no silhouette), the density is that of the training
-    split: mean 0, and the standard deviations of the targets. Its gradient with respect to the image is set to 0.
+    mean. `calibrate` sets its standard deviations to the root mean square errors on the validation split. Fits whose
+    image agrees with the input to within `enough` have other standard deviations than the other fits. Before
+    calibration, and for inputs that are not images of a body (numbers outside [0, 1], or no silhouette), the density is
+    that of the training split: mean 0, and the standard deviations of the targets. The gradient of the density with
+    respect to the image is set to 0.
 
     Attributes:
         steps: largest number of steps of a stage (a knob).

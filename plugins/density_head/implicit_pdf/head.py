@@ -34,9 +34,9 @@ class ImplicitPDFHead(DensityHead):
     linear one.
 
     The density of a prediction is constant in each of `cells` cells of equal volume, with f at the centre of the cell,
-    so that it is normalised exactly. Where the true density is wider than a cell, the loss by constant cells is about
-    h²/(24 σ²) nats for each of the three axes, for cells of width h and a standard deviation σ about the axis: 0.02
-    nats for 36,864 cells (7.5°) and 10°.
+    so that it is normalised exactly. The constant cells cost log-likelihood. Let h be the width of a cell, and σ > h
+    the standard deviation of the true density about an axis. The cost is then about h²/(24 σ²) nats for each of the
+    three axes: 0.02 nats for 36,864 cells (h = 7.5°) and σ = 10°.
 
     The loss compares f at the label with f at the centres of `training_cells` cells, in a random rotation A that the
     samples of a batch share:

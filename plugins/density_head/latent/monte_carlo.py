@@ -285,8 +285,9 @@ class NormalPoints:
         replicates: number R of replicates, the independent parts of an item's points.
         dimensions: dimensions of z.
         dtype, device: dtype and device of the points.
-        kept_count: number of points at the start of each replicate that stay in memory after their first use,
-            because many values are evaluated at the same points; 0 is used if this would exceed LARGEST_KEPT.
+        kept_count: number of points at the start of each replicate that stay in memory after their first use, because
+            many values are evaluated at the same points. If the points of all items and replicates hold more than
+            LARGEST_KEPT numbers, none of them is kept.
     """
 
     def __init__(

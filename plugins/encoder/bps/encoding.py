@@ -157,9 +157,9 @@ def encode(
 def encode_distances(clouds: Tensor, basis: Basis) -> Float[Tensor, "batch k"] | None:
     """Return the feature "distance" of clouds normalised to the unit ball, with the same bits as `encode`.
 
-    For clouds with padding, attributes, a gradient or numbers that are not finite, and for clouds that are not float32
-    or not on the CPU, the function returns None; the caller then uses `encode`. For one cloud of 2,048 points, the
-    checks and tensors that this function leaves out take half as long as the search itself.
+    The function is for clouds of finite float32 numbers on the CPU, without padding, attributes and gradient. For all
+    other clouds it returns None, and the caller uses `encode`. For one cloud of 2,048 points, the checks and tensors
+    that this function leaves out take half as long as the search itself.
     """
     if (
         torch.compiler.is_exporting()  # first, because a trace depends on no size

@@ -38,10 +38,11 @@ def frame(coordinates: Float[Tensor, "batch points 3"], reach: float = 1.0) -> F
     its direction is the one that makes the frame right-handed. A mirror plane makes this skewness 0, so that the frame
     of a cloud with mirror planes is determined up to the cloud's own symmetries.
 
-    `symmetric_frame` chooses the frame if two second moments are equal up to rounding, as for a cube, or if fewer than
-    two axes have a third moment that is clearly not 0, as for a cloud that the reflection x → -x does not change. If
-    two second moments are nearly equal, as for points drawn on a cylinder, a small change of the cloud can rotate its
-    axes by a large angle. The frame is differentiable in the clouds to any order, except where eigenvalues are equal.
+    `symmetric_frame` chooses the frame in two cases: if two second moments are equal up to rounding, as for a cube; and
+    if fewer than two axes have a third moment that is clearly not 0, as for a cloud that the reflection x → -x does not
+    change. If two second moments are nearly equal, as for points drawn on a cylinder, a small change of the cloud can
+    rotate its axes by a large angle. The frame is differentiable in the clouds to any order, except where eigenvalues
+    are equal.
 
     Args:
         coordinates: coordinates relative to the origin; rows of NaN are padding.

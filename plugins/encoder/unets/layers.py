@@ -21,7 +21,7 @@ EPSILON = 1e-5
 SLOWEST = 0.02
 """Smallest weight of the newest batch in the running moments.
 
-The weight of batch number n is 1/n as long as this is larger, so that the running moments of the first batches are
+The weight of batch number n is 1/n as long as 1/n exceeds SLOWEST, so that the running moments of the first batches are
 means over all batches so far.
 """
 LARGEST_RATIO, LARGEST_SHIFT = 3.0, 5.0

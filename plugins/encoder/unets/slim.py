@@ -20,8 +20,8 @@ class Slim(CroppedUNet):
     """A small U-Net that first rearranges squares of `unshuffle`² pixels as channels (the inverse of Shi et al. 2016).
 
     Each level has one 3×3 convolution on the way down and one on the way up. A 2×2 convolution of stride 2 leads to the
-    next lower level. On the way up, a 3×3 convolution gives the channels of the upper level, each number is repeated on
-    2×2 pixels, and the upper level's maps from the way down are added.
+    next lower level. On the way up, a 3×3 convolution gives the channels of the upper level. Each number of its output
+    is repeated on 2×2 pixels, and the maps of the upper level from the way down are added.
 
     An input of 1 in every channel is empty background, and so is everything beyond the border: sides are padded with
     empty background to a multiple of unshuffle × 2 ** (levels - 1) pixels.

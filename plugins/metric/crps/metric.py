@@ -17,9 +17,10 @@ from plugins.metric.crps.score import REPLICATES, crps
 class CRPS(Mean):
     """Continuous ranked probability score (CRPS): a proper scoring rule in the unit of the target; lower is better.
 
-    `crps` of real numbers, or `crps_deg` of angles in degrees, is the mean over the numbers of a sample, each under its
-    marginal density, and then over samples, with a standard error. `crps_<name>` is the score of one number of a target
-    with several. For a point mass, the score is the absolute deviation of the point.
+    `crps` is for real numbers, and `crps_deg` for angles, in degrees. Each number of a target is scored under its
+    marginal density. The score of a sample is the mean over its numbers; the mean over samples is reported with its
+    standard error. `crps_<name>` is the score of one number of a target with several. For a point mass, the score is
+    the absolute deviation of the point.
 
     If scores are estimated from draws (`score.py`), `crps_mc_error` is the standard error of `crps` that is due to the
     draws only.

@@ -76,8 +76,8 @@ def landings(
     With the true landing place y, the CRPS of draws x_i is mean |x_i - y| - 1/2 mean |x_i - x_j| over i ≠ j, as a mean
     over x and y coordinates (Gneiting & Raftery 2007, eq. 21). The ellipse holds 90 % of a normal density with the mean
     m and the covariance C of the draws: (y - m)ᵀ C⁻¹ (y - m) ≤ 4.605, the 90 % quantile of χ² with two degrees of
-    freedom. If fewer than 10 draws land, the CRPS is replaced by the mean absolute difference, in x and y, of the last
-    positions of all draws from y, and y counts as outside of the ellipse.
+    freedom. If fewer than 10 draws land, y counts as outside of the ellipse. The CRPS is then replaced by the mean
+    absolute difference, in x and y, between y and the last positions of all draws.
     """
     place, lands = crossing(truth, height)
     points, lands_there = crossing(draws, height)

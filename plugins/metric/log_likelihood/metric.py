@@ -40,11 +40,11 @@ class LogLikelihood(Moments):
 
     A target with density 0 has log-likelihood -inf; the mean is then -inf and the standard error NaN.
 
-    If log_prob is a Monte Carlo estimate, the metric also reports the mean without its first-order bias, the standard
-    error due to sampling only, the mean and the largest number of samples per item, and the number of items that did
-    not reach the requested tolerance. The debiased mean and the sampling error are NaN if there is only one replicate.
-    For a density that does not declare whether its log_prob draws samples, the only additional result is the sampling
-    error, which is NaN.
+    If log_prob is a Monte Carlo estimate, the metric has additional results: the debiased mean, which is the mean
+    without its first-order bias; the sampling error, which is the standard error due to sampling only; the mean and the
+    largest number of samples per item; and the number of items that did not reach the requested tolerance. The debiased
+    mean and the sampling error are NaN if there is only one replicate. For a density that does not declare whether its
+    log_prob draws samples, the only additional result is the sampling error, which is NaN.
     """
 
     bibtex = "gneiting2007strictly"

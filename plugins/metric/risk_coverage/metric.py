@@ -36,8 +36,8 @@ RISKS = {
 class RiskCoverage(Metric, HasFigure):
     """Error of the most confident share of predictions, against that share.
 
-    The risk is the error rate for classes, the mean absolute error over the numbers of a target for real numbers (in
-    their unit), and the mean angular deviation in degrees for angles, for which the keys end in `_deg`.
+    For classes, the risk is the error rate. For real numbers, it is the mean absolute error over the numbers of a
+    target, in their unit. For angles, it is the mean angular deviation in degrees, and the keys end in `_deg`.
 
     - `aurc`: area under the curve, the mean risk over all shares.
     - `e_aurc`: `aurc` minus the area for a perfect order of confidence; 0 if all mistakes are less confident than all

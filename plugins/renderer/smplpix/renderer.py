@@ -42,10 +42,10 @@ class SMPLpix(TrainedRenderer):
         checkpoint: folder of a run, its model.ckpt, or an MLflow run id.
         paths: files and folders that the run's configuration names. A path that is stored in the checkpoint is used
             only if it is repeated here, as in `renderer.paths={encoder: {rasterised: {body: ...}}}`.
-        precision: number type of evaluation. "auto" computes in bfloat16 if the processor computes it faster than
-            float32 and if colours of a test image then differ from those by float32 by at most `LARGEST_CHANGE`, and
-            by at most `MEAN_CHANGE` on average; otherwise in float32. "trained" is the run's setting, which gives the
-            same bits as the run's own predictions.
+        precision: number type of evaluation. "auto" is bfloat16 under two conditions, and float32 otherwise: the
+            processor computes bfloat16 faster than float32; and the colours of a test image by bfloat16 and by float32
+            differ by at most `LARGEST_CHANGE`, and by at most `MEAN_CHANGE` on average. "trained" is the run's
+            setting, which gives the same bits as the run's own predictions.
         crop: margin in pixels; the image is computed only in the subject's bounding box plus this margin. "whole"
             computes the whole image; "trained" uses the run's setting.
 

@@ -102,8 +102,8 @@ class Chain(nn.Module):
 def build_chain(networks: Sequence[nn.Module], dropout: Sequence[float | None]) -> Chain | None:
     """Return the networks as a `Chain`.
 
-    The result is None if a network has layers that `Chain` cannot compute, or if its outputs differ from those of the
-    chain, because its `forward` does more than apply its layers.
+    The result is None if a network has layers that `Chain` cannot compute. It is also None if the outputs of a network
+    differ from those of the chain, because the network's `forward` does more than apply its layers.
     """
     layers = [layers_of(network) for network in networks]
     first = next((layer for layer in layers[0] or () if isinstance(layer, nn.Linear)), None)
@@ -129,8 +129,9 @@ def build_chain(networks: Sequence[nn.Module], dropout: Sequence[float | None]) 
 def layers_of(network: nn.Module) -> list[nn.Module] | None:
     """Return the layers of a network in their order if `Chain` can compute them; None otherwise.
 
-    A network is accepted if its modules are nested `Sequential`s and modules with a `Sequential` named `layers` (such
-    as the encoder `mlp`) of linear layers with a bias, pointwise functions and dropout.
+    A network is accepted if it consists of linear layers with a bias, pointwise functions and dropout. These layers may
+    be in nested `Sequential`s, and in modules whose only child is a `Sequential` named `layers`, such as the encoder
+    `mlp`.
     """
     if isinstance(network, nn.Sequential):
         parts = [layers_of(part) for part in network]

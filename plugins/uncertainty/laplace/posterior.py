@@ -46,9 +46,9 @@ def fisher_of_raw(
 
     It is E[g gᵀ] over targets y of the predicted density, with the score g = ∇ log p(y | raw). Where the raw parameters
     are natural parameters, it equals the generalised Gauss-Newton matrix (Martens 2020); it is positive
-    semi-definite for every density. The expectation is a sum over all classes, or the Hessian of -log p where this
-    Hessian is the same for all y (such as a normal density of fixed variance); for any other density it is a mean over
-    DRAWS draws of y.
+    semi-definite for every density. For classes, the expectation is a sum over all classes. If the Hessian of -log p is
+    the same for all y, as for a normal density of fixed variance, the expectation is this Hessian. For any other
+    density, it is a mean over DRAWS draws of y.
 
     Args:
         density_of: function from raw parameters to densities of batch_shape (batch,).
@@ -199,8 +199,8 @@ def draw_deviations(
     """Return deviations of the weights from their mean, of the covariance (H + λ I)⁻¹.
 
     They are the symmetric root of the covariance times the noise. This root is a continuous function of H and does not
-    depend on the signs of the eigenvectors, so that H from another machine, or from the samples in another order, gives
-    nearly the same deviations.
+    depend on the signs of the eigenvectors. An H that differs only by rounding, because it comes from another machine
+    or from the samples in another order, therefore gives nearly the same deviations.
 
     Args:
         eigen: H.

@@ -42,11 +42,11 @@ class Laplace(Uncertainty, ReadsTraining):
     """Mixture, with equal weights, of the densities under S draws of the final layer's weights (Daxberger et al. 2021).
 
     The posterior of the weights is N(W*, (H + λ I)⁻¹): W* are the trained weights, H is the Fisher information of the
-    training split, which is the generalised Gauss-Newton matrix for natural parameters, and λ is the precision of a
-    normal prior (posterior.py). The wrapped model may have any density head that has a final linear layer; the model
-    trains as it would without the wrapper. The S draws use the same noise in every prediction. Before `calibrate`, the
-    wrapper returns the densities of the model. If `calibrate` gets no training split, it fits H to the samples that it
-    is given.
+    training split, and λ is the precision of a normal prior (posterior.py). If the raw parameters are natural
+    parameters, H is the generalised Gauss-Newton matrix. The wrapped model may have any density head that has a final
+    linear layer; the model trains as it would without the wrapper. The S draws use the same noise in every prediction.
+    Before `calibrate`, the wrapper returns the densities of the model. If `calibrate` gets no training split, it fits H
+    to the samples that it is given.
 
     Args:
         covariance: "full" for all weights together; "kronecker" for a product of a matrix over raw parameters and one
