@@ -24,7 +24,7 @@ class Grid:
         gap: Largest time between two frames, seconds, across which a target is interpolated; a window with a wider gap
             in its future is left out.
         outlier: Distance, metres, between a frame and the position that its neighbours suggest, above which the frame
-            is not used as a target. It is still read.
+            is not used as a target. The model still reads the frame.
     """
 
     observed: Annotated[int, Field(ge=3, le=1000)] = 20

@@ -172,8 +172,8 @@ def fit_width(residual: Float[Tensor, "sample tree number"]) -> Float[Tensor, "n
     """Return widths σ that maximise Σ_i log (1/T) Σ_t Π_d N(residual_itd; 0, σ_d²), by expectation maximisation.
 
     i is the sample, t one of T trees, and d the number of the target. A round computes r_it = N(residual_it; 0, σ²) /
-    Σ_s N(residual_is; 0, σ²), then σ_d² = mean_i Σ_t r_it residual_itd² (Dempster, Laird & Rubin 1977). It never lowers
-    the likelihood. The search starts from the largest useful width, at which all trees have similar weights.
+    Σ_s N(residual_is; 0, σ²), then σ_d² = mean_i Σ_t r_it residual_itd² (Dempster, Laird & Rubin 1977). A round never
+    lowers the likelihood. The search starts from the largest useful width, at which all trees have similar weights.
     """
     squares = residual.square()
     variance = squares.mean((0, 1)).clamp(min=FLOOR**2)

@@ -38,8 +38,9 @@ class VoxNet(Encoder):
     "voxnet" has a 5 × 5 × 5 convolution of stride 2, 3 × 3 × 3 convolutions, 2 × 2 × 2 max-pooling, and one fully
     connected layer. Leaky ReLU follows each convolution. Dropout follows the first convolution, the pooling and the
     last layer. "conv3d" has 3 × 3 × 3 convolutions, each with ReLU and batch norm, and max-pooling after every second
-    one. Dropout follows each fully connected layer. The thesis does not state the channels of "conv3d": the default
-    ones give the number of parameters and the model size of its Tables 6.2 and 6.3 (README).
+    convolution. Dropout follows each fully connected layer. The thesis does not state the channels of "conv3d"; with
+    the default channels, the network has the number of parameters and the size that Tables 6.2 and 6.3 of the thesis
+    state (README).
 
     Args:
         input_shape: (channels, side, side, side).

@@ -135,8 +135,8 @@ class FromGround(torch.autograd.Function):
     """The function relu(gain s + offset) minus its value on the background, where s are the standardised maps.
 
     The maps are 0 on the empty background. The backward pass is written out, because autograd of the same formula makes
-    many more passes over the maps. It takes into account that mean and variance, and with them the value on the
-    background, are functions of the maps.
+    many more passes over the maps. Mean and variance, and with them the value on the background, are functions of the
+    maps; the backward pass takes this into account.
     """
 
     @staticmethod

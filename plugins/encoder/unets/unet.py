@@ -24,7 +24,7 @@ class UNet(CroppedUNet):
 
     Args:
         input_shape: (channels, height, width); the network also reads images of other heights and widths.
-        width: channels of the first level; each further level has twice as many as the one above.
+        width: channels of the first level; each further level has twice as many channels as the level above it.
         levels: number of levels.
         normalisation: "batch", by the moments of the batch; "renorm", by the moments of the batch, corrected towards
             the running moments; or "group", by the moments of each image's groups of channels. See `layers.Layer`.

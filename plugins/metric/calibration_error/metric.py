@@ -239,7 +239,8 @@ def expected_error(bins: Bins) -> Float64[Tensor, ""]:
     """Return the expected calibration error Σ_l |B_l|/Q |conf(B_l) - acc(B_l)| (eq. 2.31); NaN without samples.
 
     conf(B_l) is the mean confidence in bin l, acc(B_l) the share of right predictions, |B_l| the number of samples in
-    the bin, and Q the number of all samples. It is computed as Σ_l |Σ conf - Σ right| / Q, so that empty bins add 0.
+    the bin, and Q the number of all samples. The error is computed as Σ_l |Σ conf - Σ right| / Q, so that empty bins
+    add 0.
     """
     return (bins.confidence - bins.right).abs().sum() / bins.count.sum()
 
@@ -259,9 +260,9 @@ def squared_error_debiased(bins: Bins) -> Float64[Tensor, ""]:
 
     conf is the mean confidence in bin l, acc the share of right predictions, |B_l| the number of samples in the bin,
     and Q the number of samples in all these bins. The formula is the squared calibration error minus an unbiased
-    estimate of the variance of acc, which the squared error contains (Bröcker 2012; Kumar et al. 2019, §5). It is
-    unbiased if the confidences within a bin are equal. If they differ, it is too low by about their variance divided by
-    |B_l|.
+    estimate of the variance of acc, which the squared error contains (Bröcker 2012; Kumar et al. 2019, §5). The result
+    is unbiased if the confidences within a bin are equal. If they differ, the result is too low by about their variance
+    divided by |B_l|.
     """
     several = bins.with_at_least(2)
     confidence, right = several.confidence / several.count, several.right / several.count

@@ -16,9 +16,9 @@ class MutualInformation(Metric):
     """Mean over samples of the entropy of the density and of its two parts, nats (Depeweg et al. 2018).
 
     - `expected_entropy`: the aleatoric part, the mean entropy of the models of a mixture over models.
-    - `mutual_information`: the epistemic part, which is the difference of the entropy of the mixture from that mean. It
-      is 0 for a single model.
-    - `total_entropy`: their sum.
+    - `mutual_information`: the epistemic part, which is the entropy of the mixture minus `expected_entropy`. It is 0
+      for a single model.
+    - `total_entropy`: the sum of both parts, which is the entropy of the mixture.
 
     Each also has a standard error, with the ending `_sem`.
 

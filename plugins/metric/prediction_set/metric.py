@@ -19,7 +19,7 @@ class PredictionSetMetric(Metric):
     - `set_coverage`: share of targets in their sets, with its standard error; best: the stated probability.
     - `set_size`: mean number of labels; for real numbers, the mean length or volume in the target's unit; for several
       angles, the mean volume in radians to the power of their number. For one angle, the result is `set_size_deg`, the
-      mean length of the arcs in degrees. It is infinite if a set is unbounded.
+      mean length of the arcs in degrees. The mean size is infinite if a set is unbounded.
     - `set_empty`: share of empty sets. An empty set shows that the input is unlike the calibration data.
 
     Raises:

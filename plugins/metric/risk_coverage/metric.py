@@ -44,9 +44,9 @@ class RiskCoverage(Metric, HasFigure):
       successes.
     - `risk_80`, `risk_95`: risk of the most confident 80 % and 95 %.
 
-    Each also has a standard error over predictions, with the ending `_sem`: the areas by the jackknife, the other two
-    by their influence function. It is NaN for a single prediction. Equally confident predictions count with their mean
-    risk, so that their order has no effect.
+    Each result also has a standard error over predictions, with the ending `_sem`: by the jackknife for the areas, and
+    by the influence function for the other two results. The standard error is NaN for a single prediction. Equally
+    confident predictions count with their mean risk, so that their order has no effect.
 
     Args:
         confidence: "entropy" for minus the predictive entropy; "mode" for the (log-)probability of the mode.

@@ -92,7 +92,7 @@ class PredictionSet(Unchanged, ValueSet):
     def scores(self, value: Tensor) -> Float[Tensor, "*shape"]:
         """Return the score of each value (*sample, *batch, *event), float64; larger is less expected.
 
-        It is in nats, and for "quantiles" in the unit of the target.
+        The score is in nats, and for "quantiles" in the unit of the target.
         """
         if self.score == "quantiles":
             low, high = self._central

@@ -253,7 +253,7 @@ class Network(NamedTuple):
 
     Attributes:
         model: the predictor itself, or the only `Model` inside its wrappers.
-        layer: its final linear layer.
+        layer: final linear layer of the model.
     """
 
     model: Predictor
@@ -265,7 +265,7 @@ class Pass(NamedTuple):
 
     Attributes:
         features: what the final layer reads, (batch, feature).
-        raw: what it returns, (batch, raw).
+        raw: what the final layer returns, (batch, raw).
         density: the density of the predictor.
     """
 
