@@ -61,7 +61,7 @@ def test_scan(folder: Path, number: int) -> Path:
 
 
 def test_registration(folder: Path, number: int) -> Path:
-    """Return the path of the registration of a test scan; FAUST does not publish them, generated people have them."""
+    """Return the path of the registration of a test scan, which only generated people have; FAUST publishes none."""
     return folder / "test" / "registrations" / f"test_reg_{number:03}.ply"
 
 

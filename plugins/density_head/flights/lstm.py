@@ -16,7 +16,7 @@ from framework.heads.parameters import require_finite
 from framework.target import Target
 
 FARTHEST = 100.0
-"""Largest absolute value of the inputs, metres or seconds, to which they are clamped."""
+"""Bound to which the absolute values of the inputs, metres or seconds, are clamped."""
 LEAST, WIDEST = 1e-4, 1e3
 """Smallest and largest standard deviation, metres."""
 

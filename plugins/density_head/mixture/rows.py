@@ -37,7 +37,7 @@ def expected_log_prob(head: MixtureHead, raw: np.ndarray, value: np.ndarray) -> 
 
 
 def hard_cases(head: DensityHead) -> Iterator[Case]:
-    """Yield cases with ordinary raw parameters, vanishing weights, and components far narrower than their distance."""
+    """Yield cases with ordinary raw parameters, vanishing weights, and narrow components far from each other."""
     assert isinstance(head, MixtureHead)
     generator = torch.Generator().manual_seed(7)
     ordinary = torch.randn(6, head.size, generator=generator)

@@ -20,7 +20,10 @@ OFFSETS = (0.0, 1e-6, 1.0, -3.0, 40.0, 1e6)
 
 
 def exact(residual: list[float], scale: Any, freedom: Any) -> Any:
-    """Return the log-density of independent numbers at `residual` from their locations, nats, as an mpmath number."""
+    """Return the log-density of independent numbers whose distances from their locations are `residual`, nats.
+
+    The result is an mpmath number.
+    """
     half = mpmath.mpf(freedom) / 2
     constant = mpmath.loggamma(half + 0.5) - mpmath.loggamma(half) - mpmath.log(2 * half * mpmath.pi) / 2
     return sum(

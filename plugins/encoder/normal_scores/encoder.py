@@ -17,10 +17,10 @@ class NormalScores(Encoder, FitsInputs):
     """All numbers of the flattened input, followed by their normal scores.
 
     The score of a value is Φ⁻¹((r - ½)/n) for its rank r among n training values (Blom 1958, ch. 6; equal values share
-    their mean rank), scaled to mean 0 and standard deviation 1 over the training samples. Between training values it is
-    interpolated linearly, and beyond them it is constant. So skewed numbers become normal, and no extreme value leaves
-    the range that the model was trained on, while the unchanged number preserves distances. Before `fit_inputs`, the
-    score of a number is the number itself, clamped to ±3.
+    their mean rank), scaled to mean 0 and standard deviation 1 over the training samples. Between training values the
+    score is interpolated linearly, and beyond them it is constant. So skewed numbers become normal, and no extreme
+    value leaves the range that the model was trained on, while the unchanged number preserves distances. Before
+    `fit_inputs`, the score of a number is the number itself, clamped to ±3.
 
     Args:
         input_shape: any; a sample is flattened.

@@ -162,7 +162,7 @@ def encode_in_parts(
     counts: Int[Tensor, "batch"],
     rows_per_point: int = 1,
 ) -> Float[Tensor, "batch features"]:
-    """Return the features that a network computes, for few clouds at a time, so that their numbers stay in caches.
+    """Return the features that a network computes, for few clouds at a time, so that all numbers stay in the caches.
 
     The function is for evaluation without a gradient: computing a gradient keeps all numbers in memory anyway, and
     batch norm in training needs the whole batch.

@@ -68,8 +68,8 @@ class Rasterised(Encoder):
     Inputs are those of `human_scans`, whose vertices are in the order of the topology. Colours are interpolated and
     averaged in linear RGB. Textures lie in the folder of the data and are read when they are first drawn. Features are
     (3, height, width), sRGB numbers in [0, 1], in the inputs' dtype; with `depth` they are (4, height, width), like
-    those of `encoder=projection`. A network can read them instead of projected points. With `ground` the image is only
-    the silhouette, black on white.
+    those of `encoder=projection`. A network can read these features instead of projected points. With `ground` the
+    image is only the silhouette, black on white.
 
     Args:
         input_shape: (points, columns).

@@ -122,8 +122,8 @@ def uncertainty_score(density: Distribution) -> Float64[Tensor, "batch"]:
     """Return a score that is high for uncertain densities.
 
     For classes, the score is 1 - max_k p_k; for other targets, it is the negative log-density at the mode. 1 - max_k
-    p_k is computed as the sum of the probabilities of all other classes. So the score of almost certain samples keeps
-    its digits, and their order, even if the largest probability rounds to 1.
+    p_k is computed as the sum of the probabilities of all other classes. The scores of almost certain samples
+    therefore keep their digits and their order, even if the largest probability rounds to 1.
     """
     if density.has_enumerate_support:
         return class_probabilities(density).sort(-1).values[:, :-1].sum(-1)

@@ -17,8 +17,8 @@ class PredictionSetMetric(Metric):
     """Coverage and mean size of the predicted sets, and the share of empty sets.
 
     - `set_coverage`: share of targets in their sets, with its standard error; best: the stated probability.
-    - `set_size`: mean number of labels; for real numbers, the mean length or volume in the target's unit; for several
-      angles, the mean volume in radians to the power of their number. For one angle, the result is `set_size_deg`, the
+    - `set_size`: mean size of the sets. It is the number of labels for classes, the length or volume in the target's
+      unit for real numbers, and the volume in radⁿ for n > 1 angles. For one angle, the result is `set_size_deg`, the
       mean length of the arcs in degrees. The mean size is infinite if a set is unbounded.
     - `set_empty`: share of empty sets. An empty set shows that the input is unlike the calibration data.
 

@@ -94,8 +94,8 @@ def error_at_coverage(
     above a quantile of the confidence. A prediction with the risk r has the influence a (r - m)/c + m - θ on θ, where a
     is 1 above the quantile and 0 below, and m is the mean risk at the quantile (delta method; Hampel 1974). m is
     estimated by the mean over the 2√n + 1 predictions around the quantile. The jackknife is not used, because it would
-    replace m by the risk of a single prediction. If several predictions have exactly the confidence at the quantile, a
-    is for each of them the share of them that θ includes.
+    replace m by the risk of a single prediction. If n predictions have exactly the confidence at the quantile, and θ
+    includes j of them, a is j/n for each of the n predictions.
     """
     count = len(risk)
     if count < 2:

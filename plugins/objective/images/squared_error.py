@@ -13,7 +13,7 @@ from plugins.objective.images.predicted import predicted_images
 
 
 class SquaredError(Objective):
-    """Mean squared difference between the sRGB values of predicted and true images; it determines their PSNR.
+    """Mean squared difference between the sRGB values of predicted and true images, which determines the PSNR.
 
     The gradient of an absolute difference is the same for every error, and its optimum is a median. A squared
     difference gives more weight to large errors, such as a silhouette in the wrong place (Wang and Bovik 2009, §II).

@@ -52,7 +52,7 @@ class RankOne(nn.Module):
             return getattr(super().__getattr__("layer"), name)
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Return the outputs of the members in use for their rows."""
+        """Return the outputs of the members in use, each computed from its own rows of the inputs."""
         if not torch.compiler.is_exporting() and self.rows not in (None, len(inputs)):
             raise ConfigError(
                 f"uncertainty batch_ensemble needs encoders whose layers keep one row for each input, but a layer got "

@@ -196,7 +196,7 @@ def most_likely_precision(eigenvalues: Float[Tensor, "weight"], square: float) -
 def draw_deviations(
     eigen: Eigen, precision: Tensor, noise: Float[Tensor, "sample weight"], shape: tuple[int, int]
 ) -> Float[Tensor, "sample raw feature"]:
-    """Return deviations of the weights from their mean, of the covariance (H + λ I)⁻¹.
+    """Return random deviations of the weights from their mean, with the covariance (H + λ I)⁻¹.
 
     They are the symmetric root of the covariance times the noise. This root is a continuous function of H and does not
     depend on the signs of the eigenvectors. An H that differs only by rounding, because it comes from another machine
