@@ -110,7 +110,7 @@ class Data(ABC):
     title: str = ""
     """Name of the data in figures and tables.
 
-    If it is empty, figures and tables show the name of the group if there is only one, and else the plugin's name.
+    If it is empty, figures and tables show the name of the only group or, if there are several, the plugin's name.
     """
     directions: tuple[str, ...] = ()
     """Words for 0°, 90°, 180° and 270° of the first angle, if that angle is the direction from which an object is seen.

@@ -114,6 +114,6 @@ def require_grey_or_color(input_shape: tuple[int, ...], by: str, smallest: int =
 
 
 def images_in_unit_range(inputs: Tensor, dtype: torch.dtype) -> Float[Tensor, "batch channels height width"]:
-    """Return images with values from 0 to 1 in a dtype, channels last in memory; integers are divided by 255."""
+    """Return images with values from 0 to 1, of type `dtype`, channels last in memory; integers are divided by 255."""
     images = inputs.to(dtype, memory_format=torch.channels_last)
     return images if inputs.is_floating_point() else images / 255

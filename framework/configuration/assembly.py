@@ -48,12 +48,12 @@ class Assembly:
     metrics: "list[Metric] | None" = None
 
     def take_head(self, target: Target) -> DensityHead | None:
-        """Return the head if it was built for `target`, else None; further calls return None."""
+        """Return the head at the first call, if it was built for `target`; return None in all other cases."""
         head, self.head = self.head, None
         return head if target == self.target else None
 
     def take_metrics(self, target: Target) -> "list[Metric]":
-        """Return the metrics if they were built for `target`, else new ones; further calls return new ones."""
+        """Return the metrics at the first call, if they were built for `target`; return new ones in all other cases."""
         metrics, self.metrics = self.metrics, None
         return metrics if metrics is not None and target == self.target else build_metrics(self.parts, target)
 

@@ -129,8 +129,8 @@ class BudgetSettings(_Strict):
     metric: str | None = None
     """Name of the error among the numbers that the model's metrics compute, such as `maad_deg`.
 
-    null chooses the first number that is better if it is lower. If the chosen number is better if it is higher, `error`
-    is its smallest allowed value.
+    null chooses the first number that is better if it is lower or, without such a number, the first number. If the
+    chosen number is better if it is higher, `error` is its smallest allowed value.
     """
     batch_size: Positive | None = None
     """Number of samples of the batch whose run time is measured.
@@ -229,7 +229,7 @@ class Settings(_Strict):
     checkpoint: str | None = None
     resume: str | None = "auto"
     stored: dict[str, Any] = {}
-    """Values by group that replace those of a checkpoint's config, such as `data.root=...` beside `checkpoint=`."""
+    """Values by group that replace those of a checkpoint's config; `data.root=...` beside `checkpoint=...` sets one."""
     experiment_name: str | None = None
     optimizer: OptimizerSettings = OptimizerSettings()
     logger: LoggerSettings = LoggerSettings()

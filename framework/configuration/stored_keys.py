@@ -1,4 +1,4 @@
-"""Translation of keys in a command that belong to a stored config, such as `data.root=...` beside `checkpoint=`."""
+"""Translation of keys that belong to a stored config, such as `data.root=...` in a command with `checkpoint=`."""
 
 import re
 from collections.abc import Sequence

@@ -110,9 +110,9 @@ class Exporting:
 
         Args:
             count: number of arrays.
-            spread: factor of their usual spread.
+            spread: factor on the usual standard deviation of the arrays; above 1, images are black or white.
             seed: seed of the random numbers.
-            padded: whether every second array ends with rows of NaN; None stands for `cloud`.
+            padded: whether every second array ends with rows of NaN; None: as `cloud` says.
         """
         generator = torch.Generator().manual_seed(seed)
         shape = (count, *self.description.input_shape)

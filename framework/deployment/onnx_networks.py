@@ -14,9 +14,12 @@ from framework.model import Model, Predictor, RawNetwork
 from framework.uncertainty import Uncertainty
 
 PROBES = (1, 3)
-"""Numbers of inputs for which a network of ONNX Runtime is compared with the original one."""
+"""Batch sizes for which a network of ONNX Runtime is compared with the original network."""
 AGREEMENT = 1e-5
-"""Largest difference between the raw parameters of ONNX Runtime and of torch, as a share of max(1, the largest one)."""
+"""Largest accepted difference between the raw parameters of ONNX Runtime and of torch.
+
+It is a share of the largest parameter, or of 1 if this parameter is smaller.
+"""
 
 
 class OnnxNetwork(nn.Module):

@@ -81,7 +81,7 @@ class Stacked(PlainDensity):
 
 
 class Reshaped(DerivedDensity):
-    """A density whose batch_shape is replaced by another one with as many items; the order of the items stays.
+    """A density whose batch_shape is replaced by another one; number and order of the items stay the same.
 
     Args:
         density: the wrapped density, with any batch_shape.

@@ -107,7 +107,10 @@ class Measure:
 
     @classmethod
     def of(cls, metrics: Sequence[Metric], key: str | None) -> "Measure":
-        """Return the number `key` of `metrics`; by default the first that is better if it is lower.
+        """Return the number `key` of `metrics` as a measure of the error.
+
+        If `key` is None, the measure is the first number that is better if it is lower or, without such a number, the
+        first number.
 
         Raises:
             ConfigError: no metric has such a number.

@@ -18,7 +18,7 @@ ROUNDS = 14
 Each round makes a peak's bracket five times narrower, or moves it: 0.1 rad becomes 1e-8 in ten rounds.
 """
 NEAR = 12.0
-"""Number of a peak's widths that the panel next to the peak covers; a second panel covers the rest."""
+"""Length of the panel next to a peak, in widths of the peak; a second panel covers the rest of the interval."""
 NODES = (32, 24)
 
 

@@ -219,7 +219,7 @@ def data_of(shards: Shards, config: Config) -> Mapping[str, Any] | None:
     """Return the resolved config of the data set that has read the files of a folder of shards; None if none is known.
 
     Raises:
-        ConfigError: The command chooses another data set, or sets what only the reading of files uses.
+        ConfigError: The command chooses another data set, or sets a key that only affects the reading of files.
     """
     for key, why in (
         ("mode.part", "a part has as many samples as a shard of mode.files"),

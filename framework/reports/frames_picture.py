@@ -10,7 +10,7 @@ from framework.figures.style import GREY, titled_figure
 Rendered = tuple[str, np.ndarray, np.ndarray | None]
 """Name of a frame, its drawn image and its true image or None, (height, width, 3) uint8."""
 ACROSS = 3
-"""Largest number of frames beside each other that have no true image."""
+"""Largest number of frames in a row of the figure, if the frames have no true images."""
 
 
 def frames_figure(frames: Sequence[Rendered], title: str, *, synthetic: bool) -> Figure:

@@ -217,7 +217,7 @@ def print_last_lines(
 ) -> None:
     """Print the machine, the run folder and its files, the lines `steps`, and the next commands.
 
-    `unit` is what `run_cost` counts.
+    `unit` is the noun for the items that `run_cost` counts.
     """
     lines = [
         f"measured on {machine(run_cost.device, run_cost.threads)}, batches of {run_cost.batch_size}; "

@@ -16,7 +16,7 @@ from framework.storage.plain_values import read_json
 PARENT = "FRAMEWORK_SWEEP_PARENT"
 """Environment variable with the id of the sweep's run in the tracking store, which becomes the parent of the job."""
 SYNCED_WITHIN = 60.0
-"""Seconds; a job that ends sooner sends nothing to the tracking store, and its sweep sends the job's journal."""
+"""Largest duration, in seconds, of a job that sends nothing to the tracking store; its sweep sends the journal."""
 RECORD = "job.json"
 VALUE = "value.json"
 PRUNED = "pruned.txt"

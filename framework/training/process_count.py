@@ -1,4 +1,4 @@
-"""Check, before a training, that a launcher has started as many processes as the settings name devices and nodes."""
+"""Check, before a training, that a launcher has started as many processes as the settings of the trainer require."""
 
 import os
 from collections.abc import Mapping
@@ -93,7 +93,7 @@ def launched_processes() -> Launched | None:
 
 
 def count_devices(trainer: Mapping[str, Any]) -> int:
-    """Return the number of devices, and so of processes, on each node that the settings of the trainer name."""
+    """Return the number of devices that the trainer's settings name for each node, which is its number of processes."""
     devices = trainer.get("devices", 1)
     if isinstance(devices, list):
         return len(devices)
