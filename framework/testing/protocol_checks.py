@@ -141,9 +141,16 @@ def check_pick(density: Distribution, worst: Worst) -> None:
 
 
 def compare_draws(density: Distribution, first: Tensor, second: Tensor, worst: Worst, label: str) -> None:
-    """Compare draws (draw, *event) with as many draws of `density` by the Kolmogorov-Smirnov statistic.
+    """Check by the Kolmogorov-Smirnov statistic that two samples have the same distribution, number by number.
 
     The error is in units of LARGEST_STATISTIC.
+
+    Args:
+        density: Density whose support tells whether the draws are classes, angles or real numbers.
+        first: Draws of one sample, (draw, *event).
+        second: As many draws of the other sample.
+        worst: Recorder of the largest error.
+        label: Name of the draws, for the finding.
     """
     count = len(first)
     if density.has_enumerate_support and density.event_shape == ():
@@ -263,7 +270,10 @@ def check_mode_candidates(density: Distribution, worst: Worst) -> None:
 
 
 def check_marginal_cdfs(density: Distribution, worst: Worst) -> None:
-    """Check that `marginal_cdfs` gives each number's share of draws below a value; the error is in standard errors."""
+    """Check that `marginal_cdfs` gives, for each number, the share of its draws below a value.
+
+    The error is in standard errors.
+    """
     value = draws_and_mode(density)
     stated = protocol.marginal_cdfs(density, value)
     if stated is None:

@@ -61,7 +61,7 @@ class Generated:
 
     Attributes:
         stood: the pose that photographs of the data set show.
-        registration: the mesh on the topology, as the data set has it.
+        registration: the registered mesh in the topology and the pose of the data set.
     """
 
     def __init__(self, crowd: Crowd, split: str, number: int, name: Name) -> None:

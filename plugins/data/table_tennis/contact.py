@@ -10,9 +10,9 @@ from framework.flights.physics import Constants, NotNegative, Positive, Vector, 
 class Spring:
     """Spring and damper that model the table, so that a contact takes a short time instead of no time.
 
-    While the ball is inside the table, the table pushes it up with N = max(0, Ω² p + 2 ζ Ω p') per mass, where p is the
-    depth of the ball inside the table. The equation of the height then has the eigenvalues Ω (-ζ ± √(ζ² - 1)). With an
-    Ω of 1e8/s the contact is 1e8 times as fast as a flight of one second.
+    While the ball is inside the table, the table pushes it up. The push per unit of mass is
+    N = max(0, Ω² p + 2 ζ Ω p'), where p is the depth of the ball inside the table. The equation of the height then has
+    the eigenvalues Ω (-ζ ± √(ζ² - 1)). With an Ω of 1e8/s the contact is 1e8 times as fast as a flight of one second.
 
     Attributes:
         frequency: Ω, 1/s.

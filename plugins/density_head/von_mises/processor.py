@@ -35,7 +35,7 @@ def applies(*arguments: Tensor) -> bool:
 
 
 def empty(count: int, shape: torch.Size, dtype: torch.dtype) -> list[Tensor]:
-    """Return `count` tensors without contents.
+    """Return `count` uninitialised tensors.
 
     They share one piece of memory from NumPy, which asks the system for large pages. For a million elements, providing
     ordinary pages, as torch requests them, would take the system as long as the computation itself.

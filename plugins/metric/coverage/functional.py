@@ -73,8 +73,8 @@ def border(density: Distribution, value: Tensor, mass: float, samples: int) -> R
 def class_border(density: Distribution, value: Int[Tensor, "batch"], mass: float) -> Region:
     """Return `Region`, the masses of the regions up to the true class and the size of the region of mass `mass`.
 
-    All are sums over the classes. The size is the number of most likely labels that hold `mass`. Of the last label
-    only the part that is needed counts, so that the size is not an integer.
+    All are sums over the classes. The size is the number of most likely labels that hold `mass` together. The last of
+    these labels counts only with the share of its probability that is needed, so that the size is not an integer.
     """
     probability = class_probabilities(density).T
     at = probability.gather(0, require_labels(value.long(), len(probability)).unsqueeze(0))
