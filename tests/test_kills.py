@@ -162,6 +162,7 @@ def test_a_killed_script_leaves_nothing_of_its_sweep(tmp_path: Path) -> None:
 
 
 END_BY_THEMSELVES = {
+    "commands.py": "within five minutes; only tests start them",
     "watch.py": "when the run's process has ended",
     "store_process.py": "with their input",
     "repository.py": "within seconds, in which they read one commit",

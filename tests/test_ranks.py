@@ -171,7 +171,8 @@ def test_ranks_that_were_stopped_go_on_under_another_launcher_to_the_same_bits(
 def test_a_loss_that_is_not_finite_stops_all_ranks_with_one_sentence(framework: Framework) -> None:
     done = framework(*TINY, *QUIET, *TWO, "+data.bad_label=3")
     assert done.code == 1, done.out
-    assert done.out.count("The training loss became nan") == 2, "one sentence a rank"
+    # one sentence for each rank; a rank that is ended because the other one has failed may print none
+    assert done.out.count("The training loss became nan") in (1, 2)
     assert "samples [3] of the training split" in done.out
     info = json.loads((done.folder / "run.json").read_text(encoding="utf-8"))
     assert info["status"] == "FAILED"

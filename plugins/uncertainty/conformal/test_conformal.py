@@ -300,6 +300,7 @@ def test_quantiles_are_conformalised_as_romano_et_al_state(miscoverage):
     assert not sets.size_error().any()
 
 
+@pytest.mark.slow
 def test_conformalised_quantiles_hold_the_stated_share_over_validation_splits():
     height, model = Target("real", ("height",)), quantile_model()
     generator = np.random.default_rng(2)
