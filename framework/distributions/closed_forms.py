@@ -224,12 +224,12 @@ def _(density: MultivariateNormal, value: Tensor) -> Tensor:
 def normal_quantile(probability: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Return z with Φ(z) = probability, where Φ is the distribution function of the standard normal density.
 
-    A probability below 2⁻⁵⁴ gives about -8.3 and not -∞; a probability above 1 - 2⁻⁵³ gives about 8.2 and not ∞.
+    A probability below 2⁻⁵⁴ gives about -8.3 and not -∞; a probability above 1 - 2⁻⁵³ gives about 8.2 and not ∞. z is
+    computed in float64 and has the dtype of the probability.
     """
-    probability = probability.clamp(2.0**-54, 1 - 2.0**-53)
-    if torch.compiler.is_exporting():
-        return _quantile_in_trace(probability)
-    return torch.special.ndtri(probability)
+    exact = probability.double().clamp(2.0**-54, 1 - 2.0**-53)
+    quantile = _quantile_in_trace(exact) if torch.compiler.is_exporting() else torch.special.ndtri(exact)
+    return quantile.to(probability.dtype)
 
 
 def _quantile_in_trace(probability: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:

@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from framework.configuration.paths import FilePath
+from framework.errors import ConfigError
 from framework.target import Target
 from plugins.data.head_pose import synthetic_heads
 from plugins.data.head_pose.archive import Archive, Source, draw_train_and_test
@@ -36,6 +37,9 @@ class Idiap(Heads):
         reading: Settings for reading images.
         images: Number of generated images.
         generator_seed: Seed of the generated images.
+
+    Raises:
+        ConfigError: degrees are expected of generated labels.
     """
 
     bibtex = "ba2005evaluation, tosato2013characterizing"
@@ -51,9 +55,13 @@ class Idiap(Heads):
         images: Annotated[int, Field(ge=20, le=1_000_000)] = 2000,
         generator_seed: Annotated[int, Field(ge=0)] = 0,
     ) -> None:
+        if root is None and angles_in != "radians":
+            raise ConfigError(
+                f"data.angles_in={angles_in} is the unit of the label file in data.root, but data.root is not set, and "
+                "generated labels are in radians. Set data.root, or leave data.angles_in out."
+            )
         self.source = Source(ARCHIVE, root, images, generator_seed)
-        # generated labels are always in radians; angles_in is for a user's own label file
-        self.angles_in: Literal["radians", "degrees"] = "radians" if root is None else angles_in
+        self.angles_in: Literal["radians", "degrees"] = angles_in
         self.reading = reading
         self.varies = reading.jitter > 0
         self.target = Target("angle", tuple(dict.fromkeys(angles or ANGLES)))

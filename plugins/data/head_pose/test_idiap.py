@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from framework.errors import DataError
+from framework.configuration.schema import build, resolve
+from framework.errors import ConfigError, DataError
 from framework.testing.data_samples import fields_of
 from plugins.data.head_pose.idiap import PEOPLE, random_pose
 from plugins.data.head_pose.idiap_labels import LABELS, Label, read_labels, write_labels
@@ -65,6 +66,11 @@ def test_labels_in_the_wrong_unit_are_refused(root: Path) -> None:
     )
 
 
+def test_unit_of_generated_labels_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"data\.angles_in=degrees is the unit .* data\.root is not set"):
+        build("data", resolve("data", {"name": "idiap", "angles_in": "degrees"}))
+
+
 def test_label_file_that_is_cut_short_or_lacks_something_is_named(root: Path) -> None:
     whole = (root / LABELS).read_bytes()
     for length in range(0, len(whole) - 1, 4999):
@@ -116,8 +122,7 @@ def test_labels_of_the_generated_set_are_the_random_poses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
-    # angles_in is for a user's own label file and has no effect on generated labels
-    data = prepare_data("idiap", None, images=60, angles_in="degrees")
+    data = prepare_data("idiap", None, images=60)
     poses = []
     for number in range(38):
         random = np.random.default_rng([0, 0, number])

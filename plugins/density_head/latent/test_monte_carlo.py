@@ -80,8 +80,9 @@ def test_the_quantile_agrees_with_40_digits_and_is_never_infinite():
                 else (1 - mpmath.mpf(place), mpmath.ncdf(-mpmath.mpf(z)))
             )
             assert abs(back / tail - 1) < 1e-13 * max(1, z * z)
-    ends = normal_quantile(torch.tensor([0.0, 1.0], dtype=torch.float64))
-    assert ends.abs().tolist() == pytest.approx([8.3, 8.2], abs=0.1)
+    for dtype in (torch.float32, torch.float64):
+        ends = normal_quantile(torch.tensor([0.0, 1.0], dtype=dtype))
+        assert ends.dtype == dtype and ends.abs().tolist() == pytest.approx([8.3, 8.2], abs=0.1)
 
 
 def test_points_are_normal_apart_and_the_same_in_both_precisions():
