@@ -220,7 +220,7 @@ class App:
 
     def until_ready(self, *numbers: int) -> None:
         def ready() -> bool:
-            assert not self.processes[-1].poll(), self.said()
+            assert not any(process.poll() for process in self.processes[-1:]), self.said()
             return all((self.sweep / str(number) / "ready").exists() for number in numbers)
 
         wait_for(ready)
