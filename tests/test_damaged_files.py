@@ -88,10 +88,12 @@ OWN_CACHE = {
     "framework/bodies/default_body.py",
     "framework/bodies/topologies.py",
     "plugins/data/labelled_clouds/reading.py",
+    "plugins/data/symmetric_solids/data.py",
 }
-"""Modules that guard files in the project's own cache; `read_npz`, which is tested here, reads these files."""
+"""Modules that guard files in the project's own cache; `read_npy` and `read_npz`, which are tested here, read them."""
 OWN_FILES = {
     "framework/configuration/citations.py": "references.bib of this and of other installed packages",
+    "framework/configuration/command_line.py": "the package's trainer/default.yaml",
     "framework/configuration/composition.py": "the package's config.yaml",
     "framework/datasets/images.py": "within a guard",
     "framework/deployment/export.py": "the package's scripts for exported folders",

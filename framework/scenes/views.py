@@ -139,7 +139,7 @@ class FileFrames:
                 f"{file}: no such file; expected the true image of the frame {self.names[index]}. Name the true images "
                 "like the images that mode=render writes into the folder `images` of its run."
             )
-        color, mask = _true_image(file, self.ground)
+        color, mask = read_true_image(file, self.ground)
         if color.shape[:2] != (camera.height, camera.width):
             raise DataError(
                 f"{file}: the image has {color.shape[1]} × {color.shape[0]} pixels, but the camera's image has "
@@ -165,10 +165,14 @@ def find_scene_files(path: Path) -> list[Path]:
     return files
 
 
-def _true_image(
+def read_true_image(
     file: Path, ground: tuple[float, float, float]
 ) -> tuple[Float[Tensor, "height width 3"], Tensor | None]:
-    """Return an image in linear RGB on `ground`, and the mask of its opaque half, or None without transparency."""
+    """Return an image in linear RGB on `ground`, and the mask of its opaque half, or None without transparency.
+
+    Raises:
+        DataError: the file cannot be read as an image.
+    """
     with translate_errors(file, "an image"), images.open_image(file) as image:
         transparent = images.has_alpha(image)
         pixels = torch.from_numpy(np.array(images.decode(image, 4, upright=False)))

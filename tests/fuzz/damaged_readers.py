@@ -22,7 +22,7 @@ from framework.datasets.images import Crop
 from framework.datasets.shards import open_shards
 from framework.geometry import meshes
 from framework.runs import resuming
-from framework.scenes import scene_files, turntable
+from framework.scenes import scene_files, turntable, views
 from framework.storage.generated import read_mark
 from framework.storage.weights import read_weights
 from framework.sweeps import jobs
@@ -179,6 +179,9 @@ def subjects() -> Iterator[Reader]:
         partial(with_buffer, document=json.dumps(parts)),
         told="scene.",
     )
+    drawn = [image("PNG", "RGBA"), image("PNG")]
+    true_image = partial(views.read_true_image, ground=(1.0, 1.0, 1.0))
+    yield Reader("PNG, true images", "one.png", drawn, true_image, [in_png], [*crafted.images()])
     yield Reader("JSON, cameras", "camera.json", [camera], turntable.read_camera)
 
 

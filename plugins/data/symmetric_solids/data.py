@@ -27,7 +27,8 @@ from framework.geometry.symmetry import (
     noise_concentration,
 )
 from framework.renderer import Renderer
-from framework.storage import cache
+from framework.storage import arrays, cache
+from framework.storage.reading import read_bytes, translate_errors
 from framework.target import Target
 from plugins.data.symmetric_solids.generator import VERSION, ensure_solid, stream
 from plugins.data.symmetric_solids.solids import SOLIDS, solid
@@ -197,15 +198,11 @@ def _read(file: Path, dtype: type) -> Tensor:
     Raises:
         DataError: the file is missing or damaged.
     """
-    try:
-        array = np.load(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DataError(
-            f"{file} cannot be read ({error}). Delete the folder {file.parent}; its data are then generated again."
-        ) from error
+    remedy = f"Delete the folder {file.parent}; its data are then generated again."
+    with translate_errors(file, "an array of generated data", remedy):
+        array = arrays.read_npy(read_bytes(file))
     if array.dtype != dtype:
         raise DataError(
-            f"{file} holds numbers of type {array.dtype}, expected {np.dtype(dtype)}. Delete the folder {file.parent}; "
-            "its data are then generated again."
+            f"{file}: holds numbers of type {array.dtype}, but {np.dtype(dtype)} is expected. {remedy}"
         )
     return torch.from_numpy(array)

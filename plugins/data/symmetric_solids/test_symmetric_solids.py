@@ -109,7 +109,9 @@ def test_a_damaged_cache_is_named(tmp_path, monkeypatch):
     prepared(solids=["cone"])
     (file,) = tmp_path.rglob("test_images.npy")
     file.write_bytes(b"garbage")
-    with pytest.raises(DataError, match=r"test_images\.npy cannot be read.*Delete the folder"):
+    with pytest.raises(
+        DataError, match=r"test_images\.npy: cannot be read as an array of generated data.*Delete the folder"
+    ):
         prepared(solids=["cone"])
 
 
