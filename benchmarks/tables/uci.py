@@ -275,7 +275,7 @@ def median_of(rows: list[dict[str, Any]], key: str) -> float | None:
 def table_of_targets(rows: list[dict[str, Any]]) -> list[str]:
     """Return the lines of a table of what was wanted of the recommended start and what it reached."""
     lines = [
-        f"| set | log-likelihood | target | 90 % region covers ({COVERED[0]}–{COVERED[1]}) | worst split | "
+        f"| set | log-likelihood | goal | 90 % region covers ({COVERED[0]}–{COVERED[1]}) | worst split | "
         f"worst split of `{DROPOUT}` | 20 runs, s (≤ {LONGEST}) | µs for a density (≤ {SLOWEST}) | with its median |",
         "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
@@ -305,16 +305,14 @@ def missed(rows: list[dict[str, Any]]) -> str:
             continue
         reached, covered = (mean(row[key] for row in own) for key in ("log_likelihood", "coverage_90"))
         if reached < TARGETS[name]:
-            texts.append(
-                f"{name}: the log-likelihood is {TARGETS[name] - reached:.3f} nats below its target."
-            )
+            texts.append(f"{name}: the log-likelihood is {TARGETS[name] - reached:.3f} nats below its goal.")
         if not COVERED[0] <= covered <= COVERED[1]:
             texts.append(f"{name}: the 90 % region covers {covered:.3f} of the test rows.")
         for key, limit, unit in (("sweep_seconds", LONGEST, "s"), ("microseconds", SLOWEST, "µs")):
             number = median_of(own, key)
             if number and number > limit:
                 texts.append(f"{name}: {number:.1f} {unit} instead of {limit} {unit}.")
-    return f"Not reached: {' '.join(texts)}" if texts else "All targets are reached."
+    return f"Goals that are not reached: {' '.join(texts)}" if texts else "All goals are reached."
 
 
 def epochs_of(rows: list[dict[str, Any]]) -> str:
@@ -344,7 +342,7 @@ def page(root: Path) -> None:
         "`uci/ensemble` and `uci/mc_dropout` are networks of one layer with 50 units, as in the literature, trained by "
         "this framework.",
         "",
-        "## Targets",
+        "## Goals",
         "",
         *table_of_targets(rows),
         "",

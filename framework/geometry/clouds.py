@@ -299,8 +299,8 @@ def require_normalised(
         cloud = int(bad.nonzero()[0])
         raise DataError(
             f"Cloud {cloud} of the batch extends to {largest[cloud]:.3g} from the origin, but {by} with "
-            f"normalise=none requires a distance from {TIGHT * reach:g} to {LOOSE * reach:g}, apart from some "
-            "outliers. Choose normalise=unit_ball."
+            f"normalise=none requires that a cloud extends to {TIGHT * reach:g} at least and {LOOSE * reach:g} at "
+            "most, apart from some outliers. Choose normalise=unit_ball."
         )
 
 

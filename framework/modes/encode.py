@@ -46,7 +46,7 @@ class EncodeOptions(Options):
     Attributes:
         files: Folder of the files, or folder of shards.
         into: Folder for the features.
-        part: Number of files in a part.
+        part: Number of files that are encoded and stored together.
         share: Share of the parts that this job computes, such as "2/4": every fourth part, from the second on.
         pack: Whether to write the inputs themselves, as shards.
     """
@@ -65,7 +65,7 @@ class Files:
     Attributes:
         root: Folder to which the names are relative.
         names: Names of the files, in order.
-        part: Number of files in a part.
+        part: Number of files that are encoded and stored together.
         data: Data set that reads the files.
         workers: Number of data-loading processes.
     """

@@ -148,8 +148,8 @@ def _choose_keys(names: list[str] | None, metrics: list[Metric], *, own: bool) -
     for key in keys:
         if key not in known:
             raise ConfigError(
-                f"mode.metrics names {key!r}, but every name must be a number for which a metric states whether higher "
-                f"or lower is better.{did_you_mean(key, known)} Choose from {', '.join(known)}."
+                f"mode.metrics names {key!r}, but every name must be that of a result for which a metric states "
+                f"whether higher or lower is better.{did_you_mean(key, known)} Choose from {', '.join(known)}."
             )
     if not keys:
         raise ConfigError(

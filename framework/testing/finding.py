@@ -122,7 +122,10 @@ class Worst:
         )
 
     def finding(self, name: str, limit: float) -> Finding:
-        """Return the finding of this property; it fails if no error was recorded, since nothing was compared."""
+        """Return the finding of the property `name`, which holds if the largest recorded error is at most `limit`.
+
+        Without any recorded error nothing was compared, so that the finding does not hold.
+        """
         error = torch.inf if self.error == -torch.inf else self.error
         case = f"NaN: {self.case}" if math.isnan(error) else self.case
         return Finding(name, case, error if math.isnan(error) else max(error, 0.0), limit)

@@ -1,4 +1,4 @@
-"""Largest error of a sample."""
+"""Metric example: the largest error among all samples."""
 
 from typing import ClassVar, Literal
 

@@ -1,4 +1,4 @@
-"""Compiled functions on NumPy arrays for robust parabolas through the last frames of flights, and their features."""
+"""Compiled fits of parabolas to the last recorded positions of balls, without outliers, and features of the fits."""
 
 from pathlib import Path
 from typing import no_type_check

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 
 class ConvNorm(nn.Module):
-    """A convolution without bias, batch norm and ReLU.
+    """A convolution without bias, followed by batch norm and ReLU.
 
     Args:
         inputs, outputs: numbers of channels.

@@ -92,9 +92,16 @@ def halve(depth, index, coarse_depth, coarse_index):
 @compiled
 @no_type_check
 def paint(cloud, index, level, nearest, farthest, image):
-    """Fill the four channels of `image` with the colours and depths of the points that `index` names.
+    """Fill `image` with the colours and depths of points; pixels without a point are 1 in all channels.
 
-    Each entry of `index` fills a square of 2^level × 2^level pixels of `image`.
+    Args:
+        cloud: as in the module's docstring.
+        index: (rows, columns), the row of `cloud` that is visible in each square of 2^level × 2^level pixels of
+            `image`, in the same place; negative where no point is visible.
+        level: base-2 logarithm of the side of a square.
+        nearest: depth that becomes 0 in the fourth channel, metres.
+        farthest: depth that becomes 1 there, metres.
+        image: (4, height, width), written: red, green, blue and scaled depth.
     """
     span = farthest - nearest
     image[:] = 1.0

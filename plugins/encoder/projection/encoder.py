@@ -29,7 +29,9 @@ NOTHING = torch.iinfo(torch.int64).max
 
 @dataclass(frozen=True)
 class CameraView:
-    """The canonical camera for an image size, the range of visible depths, and the number of levels.
+    """The camera that all images share (`framework.geometry.camera.canonical_camera`), for one size of images.
+
+    It also holds the range of visible depths and the number of levels.
 
     Attributes:
         height, width: size of the image, pixels.

@@ -55,7 +55,7 @@ class DrawingSettings:
 
     @property
     def uses_soft(self) -> bool:
-        """True if `soft` draws the colours."""
+        """True if the rasteriser with soft edges (module `soft`) draws the colours."""
         return "color" in self.channels and self.gradient == "soft"
 
 
