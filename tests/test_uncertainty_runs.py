@@ -130,7 +130,7 @@ def test_a_sweep_becomes_an_ensemble_and_its_first_member_is_trained_alike_in_on
         folder="wrong",
     )
     assert wrong.code == 2
-    assert "has the key 'nil'" in wrong.out
+    assert "mode.metrics names 'nil'" in wrong.out
     assert "'nll'" in wrong.out
 
 
