@@ -105,7 +105,8 @@ class Command:
                         os.kill(process.number, signal.SIGKILL)
                 return float("inf")
             time.sleep(0.05)
-        self.process.poll()
+        if some is None:
+            self.process.wait(patience)  # its environment is gone before it has ended
         return time.monotonic() - start
 
 
