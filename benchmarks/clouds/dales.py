@@ -4,7 +4,7 @@
         experiment=dales/bps_mlp,dales/point_nn,dales/deepsets_micro,dales/pointnet_vanilla \\
         data.root=/path/to/dales500.npz data.fold=0,1,2,3,4 threads=1 hydra.launcher.jobs=1 \\
         pictures=false logger=none hydra.sweep.dir=outputs/sweeps/dales
-    python -m benchmarks.clouds.dales outputs/sweeps/dales
+    python -m benchmarks.clouds.dales outputs/sweeps/dales /path/to/dales500.npz
 
 Writes dales.md and dales.png into the folder of this file.
 """
@@ -20,7 +20,9 @@ import numpy as np
 import torch
 
 from benchmarks.pages import machine, publish
-from benchmarks.sweeps import milliseconds_per_sample
+from framework.configuration.loading import load_with_description
+from framework.configuration.schema import build, resolve
+from framework.evaluation.splits import cost
 from framework.figures.style import COLOURS, MARKERS, save_figure, titled_figure
 from framework.reports.table import markdown
 from framework.training.batches import Batches
@@ -44,16 +46,24 @@ COLUMNS = {
 Fold = Mapping[str, Any]
 
 
-def read_folds(sweep: Path) -> dict[str, list[Fold]]:
+def read_folds(sweep: Path, archive: Path) -> dict[str, list[Fold]]:
     """Return the results of each method, a list over the folds; run times are measured now, on one thread."""
     folds: dict[str, list[Fold]] = {}
-    loaders: dict[str, Batches] = {}
     torch.set_num_threads(1)
     for path in sorted(sweep.glob("*/results.json")):
         results = json.loads(path.read_text(encoding="utf-8"))
-        results["milliseconds"] = milliseconds_per_sample(path.parent, loaders)
+        results["milliseconds"] = milliseconds_per_cloud(path.parent, archive)
         folds.setdefault(results["experiment"], []).append(results)
     return {experiment: folds[experiment] for experiment in NAMES if experiment in folds}
+
+
+def milliseconds_per_cloud(run: Path, archive: Path) -> float:
+    """Return the time of density and point prediction per cloud of a fold's test split, in batches of 16."""
+    model, description = load_with_description(run)
+    data = build("data", resolve("data", {**description.config["data"], "root": str(archive)}))
+    data.prepare()
+    inputs = next(iter(Batches(data, batch_size=16, workers=0, seed=0).test_dataloader()))
+    return cost(model, inputs, samples=1, device=torch.device("cpu")).milliseconds_per_sample
 
 
 def over_folds(folds: Sequence[Fold], key: str) -> tuple[float, float]:
@@ -94,14 +104,36 @@ def draw(rows: Sequence[Mapping[str, Any]]) -> None:
             label=result["method"],
         )
     axes.set_xscale("log")
+    axes.set_xticks([1, 3, 10, 30])
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("")
     axes.set_xlabel("ms per cloud (one thread)")
     axes.set_ylabel("accuracy, mean of five folds")
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False, fontsize=9)
     save_figure(figure, Path(__file__).with_suffix(""), True)
 
 
+def conclusion(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return a sentence about the methods whose accuracy is within its error of the highest one."""
+    best = max(rows, key=lambda row: row["accuracy"])
+    near = [
+        row
+        for row in rows
+        if best["accuracy"] - row["accuracy"] <= math.hypot(best["accuracy_sem"], row["accuracy_sem"])
+    ]
+    fastest = min(near, key=lambda row: row["milliseconds"])
+    others = [
+        f"{row['method']} ({row['mflop'] / fastest['mflop']:.0f} times the operations, "
+        f"{row['milliseconds'] / fastest['milliseconds']:.1f} times the run time)"
+        for row in near
+        if row is not fastest
+    ]
+    text = f"**{fastest['method']}** is the fastest of the methods with the highest accuracy within the standard error"
+    return f"{text}; the others are {', '.join(others)}." if others else f"{text}, and the only one."
+
+
 def main() -> None:
-    results = read_folds(Path(sys.argv[1]))
+    results = read_folds(Path(sys.argv[1]), Path(sys.argv[2]).absolute())
     rows = [row(experiment, folds) for experiment, folds in results.items()]
     draw(rows)
     count = sum(fold["test_samples"] for fold in next(iter(results.values())))
@@ -121,6 +153,7 @@ def main() -> None:
         "deviation of the accuracy over the folds. MFLOP counts the operations of matrix products alone, and not the "
         "search for neighbours or the sines; ms per cloud is measured on one thread and contains everything.\n\n"
         f"{markdown(rows, COLUMNS)}\n"
+        f"{conclusion(rows)}\n\n"
         "![Accuracy and run time](dales.png)\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"
     )
