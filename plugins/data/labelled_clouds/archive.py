@@ -49,7 +49,7 @@ def read_archive(root: str | None) -> Archive:
             f"an extract of 499 objects is at {SOURCE}. {REMEDY}"
         )
     file = Path(root).expanduser()
-    with translate_errors(file, "a NumPy archive", REMEDY, f"expected {LAYOUT}"):
+    with translate_errors(file, "a NumPy archive", REMEDY, f"expected {LAYOUT} Correct data.root."):
         return _check_arrays(file, read_npz(read_bytes(file)))
 
 

@@ -125,6 +125,10 @@ def test_other_archives_are_refused(data, prepare_data, tmp_path):
     np.save(tmp_path / "array.npy", np.zeros(3))
     with pytest.raises(DataError, match="the file is a single array"):
         prepare_data(root=tmp_path / "array.npy")
+    with pytest.raises(
+        DataError, match=r"nowhere\.npz: no such file; expected a \.npz archive .*Correct data\.root"
+    ):
+        prepare_data(root=tmp_path / "nowhere.npz")
 
 
 def test_a_class_of_few_objects_keeps_its_training_samples(prepare_data, tmp_path):

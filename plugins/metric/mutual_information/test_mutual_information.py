@@ -33,11 +33,11 @@ def test_entropies_of_class_mixtures_equal_sums_in_numpy():
     expected = special.entr(probability).sum(-1).mean(1)
     total = special.entr(probability.mean(1)).sum(-1)
     parts = (Categorical(logits=part, validate_args=False) for part in logits.split([4, 3]))
-    found = compute_metric(*map(over_models, parts))
-    assert found["expected_entropy"] == pytest.approx(expected.mean(), rel=1e-12)
-    assert found["mutual_information"] == pytest.approx((total - expected).mean(), rel=1e-10)
-    assert found["total_entropy"] == pytest.approx(total.mean(), rel=1e-12)
-    assert found["mutual_information_sem"] == pytest.approx(stats.sem(total - expected), rel=1e-8)
+    results = compute_metric(*map(over_models, parts))
+    assert results["expected_entropy"] == pytest.approx(expected.mean(), rel=1e-12)
+    assert results["mutual_information"] == pytest.approx((total - expected).mean(), rel=1e-10)
+    assert results["total_entropy"] == pytest.approx(total.mean(), rel=1e-12)
+    assert results["mutual_information_sem"] == pytest.approx(stats.sem(total - expected), rel=1e-8)
 
 
 def test_entropies_of_normal_mixtures_equal_quadrature():
@@ -45,7 +45,7 @@ def test_entropies_of_normal_mixtures_equal_quadrature():
         torch.tensor([[[-1.0], [0.5], [3.0]]]).double(),
         torch.tensor([[[0.4], [1.0], [0.7]]]).double(),
     )
-    found = compute_metric(over_models(Independent(Normal(place, scale, validate_args=False), 1)))
+    results = compute_metric(over_models(Independent(Normal(place, scale, validate_args=False), 1)))
     normals = [stats.norm(float(m), float(s)) for m, s in zip(place.flatten(), scale.flatten(), strict=True)]
 
     def integrand(value):
@@ -53,8 +53,8 @@ def test_entropies_of_normal_mixtures_equal_quadrature():
 
     total = integrate.quad(integrand, -8, 12, limit=400)[0]
     expected = np.mean([normal.entropy() for normal in normals])
-    assert found["expected_entropy"] == pytest.approx(expected, rel=1e-10)
-    assert found["mutual_information"] == pytest.approx(total - expected, abs=1e-6)
+    assert results["expected_entropy"] == pytest.approx(expected, rel=1e-10)
+    assert results["mutual_information"] == pytest.approx(total - expected, abs=1e-6)
 
 
 def test_only_models_have_mutual_information_and_not_components_of_a_head():
@@ -75,6 +75,6 @@ def test_only_models_have_mutual_information_and_not_components_of_a_head():
 
 def test_members_that_disagree_without_doubt_have_mutual_information_only():
     logits = torch.tensor([[[100.0, -100.0], [-100.0, 100.0]]]).double()
-    found = compute_metric(over_models(Categorical(logits=logits, validate_args=False)))
-    assert found["expected_entropy"] == pytest.approx(0, abs=1e-12)
-    assert found["mutual_information"] == pytest.approx(np.log(2))
+    results = compute_metric(over_models(Categorical(logits=logits, validate_args=False)))
+    assert results["expected_entropy"] == pytest.approx(0, abs=1e-12)
+    assert results["mutual_information"] == pytest.approx(np.log(2))

@@ -231,5 +231,5 @@ def test_members_that_disagree_are_outliers_by_mutual_information():
 
     disagree = members(torch.tensor([[[9.0, 0.0, -9.0], [0.0, 9.0, -9.0]]]).double())
     undecided = members(torch.zeros(1, 2, 3).double())
-    found = compute_metric([disagree], [undecided], score="mutual_information")
-    assert found["auroc"] == 1 and compute_metric([disagree], [undecided])["auroc"] == 0
+    results = compute_metric([disagree], [undecided], score="mutual_information")
+    assert results["auroc"] == 1 and compute_metric([disagree], [undecided])["auroc"] == 0

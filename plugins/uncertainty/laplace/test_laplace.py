@@ -74,8 +74,10 @@ def test_a_linear_model_of_fixed_variance_has_the_posterior_of_bayesian_linear_r
         return normal.log_prob(target[:, 0].double()).item()
 
     # the weights of highest likelihood are not those of highest posterior, so the evidence is Laplace's approximation
-    found = optimize.minimize_scalar(lambda point: -evidence(point), bounds=(-5, 5), method="bounded").x
-    assert math.log(precision) == pytest.approx(found, abs=0.05)
+    log_precision = optimize.minimize_scalar(
+        lambda point: -evidence(point), bounds=(-5, 5), method="bounded"
+    ).x
+    assert math.log(precision) == pytest.approx(log_precision, abs=0.05)
 
 
 def test_the_information_of_a_classifier_is_the_hessian_of_its_loss():
@@ -124,14 +126,14 @@ def test_the_prior_precision_maximises_the_marginal_likelihood():
         return (5 * log_precision - precision * square - log_determinant) / 2
 
     for square in (1e-3, 0.7, 40.0):
-        found = math.log(most_likely_precision(values, square))
+        log_precision = math.log(most_likely_precision(values, square))
         best = optimize.minimize_scalar(
             lambda point, square=square: -log_evidence(point, square),
             bounds=(-25, 25),
             method="bounded",
             options={"xatol": 1e-9},
         ).x
-        assert found == pytest.approx(best, abs=1e-4)
+        assert log_precision == pytest.approx(best, abs=1e-4)
 
 
 @pytest.mark.parametrize("extreme, bound", [((torch.zeros(3), 1.0), 1e-12), ((torch.ones(3), 0.0), 1e12)])

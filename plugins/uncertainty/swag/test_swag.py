@@ -30,32 +30,32 @@ def moments(size, rank, dtype=torch.float64):
 @pytest.mark.parametrize("dtype, error", [(torch.float32, 1e-5), (torch.float64, 1e-12)])
 def test_the_moments_are_those_of_the_stored_weights(dtype, error):
     path = 1000 + np.cumsum(np.random.default_rng(0).normal(size=(13, 5)), 0)
-    found = moments(5, 4, dtype)
+    statistics = moments(5, 4, dtype)
     for weights in path:
-        add(found, torch.tensor(weights, dtype=dtype))
-    assert found.count == 13
-    np.testing.assert_allclose(found.mean.numpy(), path.mean(0), rtol=error)
-    np.testing.assert_allclose(found.squares.numpy() / 13, path.var(0), rtol=1e3 * error)
+        add(statistics, torch.tensor(weights, dtype=dtype))
+    assert statistics.count == 13
+    np.testing.assert_allclose(statistics.mean.numpy(), path.mean(0), rtol=error)
+    np.testing.assert_allclose(statistics.squares.numpy() / 13, path.var(0), rtol=1e3 * error)
     columns = {number % 4: path[number] - path[: number + 1].mean(0) for number in range(9, 13)}
     stored = np.array([columns[row] for row in range(4)])
-    np.testing.assert_allclose(found.deviations.numpy(), stored, atol=1e3 * error, rtol=0)
+    np.testing.assert_allclose(statistics.deviations.numpy(), stored, atol=1e3 * error, rtol=0)
 
 
 @pytest.mark.parametrize("epochs", [3, 9])
 def test_the_covariance_of_draws_is_half_diagonal_and_half_of_low_rank(epochs):
     path = np.random.default_rng(1).normal(size=(epochs, 6))
-    found = moments(6, 4)
+    statistics = moments(6, 4)
     for weights in path:
-        add(found, torch.tensor(weights))
+        add(statistics, torch.tensor(weights))
     # unit vectors instead of noise give the columns of a root of the covariance
     columns = np.array(
-        [(draw(found, unit) - found.mean).numpy() for unit in torch.eye(10, dtype=torch.float64)]
+        [(draw(statistics, unit) - statistics.mean).numpy() for unit in torch.eye(10, dtype=torch.float64)]
     )
     running = np.cumsum(path, 0) / np.arange(1, epochs + 1)[:, None]
     last = (path - running)[-4:]
     wanted = np.diag(path.var(0)) / 2 + last.T @ last / (2 * (len(last) - 1))
     np.testing.assert_allclose(columns.T @ columns, wanted, rtol=1e-10, atol=1e-12)
-    assert torch.equal(draw(found, torch.zeros(10, dtype=torch.float64)), found.mean)
+    assert torch.equal(draw(statistics, torch.zeros(10, dtype=torch.float64)), statistics.mean)
 
 
 def model(encoder, head="gaussian"):
