@@ -23,6 +23,11 @@ class Decimated(NamedTuple):
     """Result of a decimation: the remaining vertices, and the corners of the triangles in the mesh and in the texture.
 
     All numbers are indices into the arrays of the mesh before decimation.
+
+    Attributes:
+        kept: the remaining vertices, ascending.
+        faces: vertices of each remaining triangle.
+        uv_faces: texture coordinates of each remaining triangle.
     """
 
     kept: Int[np.ndarray, "left"]  # this name is a key of cached files
@@ -41,6 +46,12 @@ def decimate(
     If several edges have equal errors, the one with the lowest vertex number is collapsed first.
 
     Seams of the texture stay seams: a vertex on a seam moves along it or not at all.
+
+    Args:
+        vertices: coordinates.
+        faces: vertices of each triangle.
+        uv_faces: texture coordinates of each triangle, as indices.
+        count: number of vertices to keep.
 
     Raises:
         DataError: no edge is left that may collapse.

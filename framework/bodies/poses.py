@@ -76,9 +76,9 @@ MOVEMENTS = (*CENTRAL, *(f"{side} {name}" for side in ("left", "right") for name
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Indices of the joints that each movement rotates; several joints share the rotation equally.
+    """Indices of a body's joints by their roles in a movement: each field holds the joints that a movement rotates.
 
-    A field with two joints holds (left, right).
+    A field with two joints holds (left, right). The joints of `spine`, and those of `neck`, share a rotation equally.
     """
 
     root: int

@@ -209,9 +209,12 @@ def split(
 ) -> Split:
     """Split edges in the middle: all edges, or those where `chosen` is true.
 
-    `chosen` is in the order of the function `edges`. New vertices are numbered from `vertices`, the number of
-    existing vertices, and new texture coordinates from `places`, the number of existing texture coordinates. With
-    `numbered_as_all`, edges that are not split also take a number, which stays unused.
+    Args:
+        corners: the triangles.
+        vertices: number of existing vertices; new vertices are numbered from this number on.
+        places: number of existing texture coordinates; new ones are numbered from this number on.
+        chosen: true for each edge to split, in the order of the function `edges`; None for all edges.
+        numbered_as_all: if true, edges that are not split also take a number, which stays unused.
     """
     pairs, sides = edges(corners.faces)
     uv_pairs, uv_sides = edges(corners.uv_faces)

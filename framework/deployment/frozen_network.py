@@ -89,6 +89,8 @@ class Network:
         result: number of the register with the raw parameters.
         dtype: data type of all numbers.
         classes: True if the register `result` has class logits instead of raw parameters.
+        session: ONNX Runtime's session for two or more samples; None if torch computes them.
+        cast_to_type: True after `cast` has converted weights and biases to `dtype`.
     """
 
     steps: list[Layer | Concatenation]
@@ -379,6 +381,13 @@ def compute_layer(numbers, weight, bias, rectified, outputs):
 
     For one sample, reading the weights takes most of the time, and after a ReLU about half of the inputs are 0. Eight
     inputs are processed at a time, so that the outputs are read and written eight times less often.
+
+    Args:
+        numbers: inputs of the layer, (inputs,).
+        weight: weights, (inputs, outputs).
+        bias: constants, (outputs,).
+        rectified: true if negative outputs are set to 0.
+        outputs: filled with the outputs, (outputs,).
     """
     length, width = weight.shape
     nonzero = np.empty(length, np.int64)

@@ -109,10 +109,10 @@ class Reshaped(DerivedDensity):
         return self.density.log_prob(flat).reshape(shape)
 
     def inner(self, value: Tensor) -> tuple[Tensor, torch.Size]:
-        """Return `value` in the batch_shape of the wrapped density, and the shape (*sample, *batch) of its log_prob.
+        """Return `value` in the batch_shape of the wrapped density, and the shape that results of log_prob must have.
 
         Args:
-            value: values (*sample, *batch, *event) in the new batch_shape.
+            value: values (*sample, *batch, *event) in the new batch_shape. The result of log_prob is (*sample, *batch).
         """
         whole = broadcast_shapes(value.shape, torch.Size((*self.batch_shape, *self.event_shape)))
         lead = whole[: len(whole) - len(self.batch_shape) - len(self.event_shape)]

@@ -124,7 +124,7 @@ class Mixture(PlainDensity):
         """Mode: for classes the most likely one, for one component its mode, otherwise a maximum found by `highest`.
 
         With `many_components.FEWEST` or more components over one number, the search starts only from the modes that
-        `likeliest_modes` returns, unless it returns None.
+        `likeliest_modes` returns. If that function returns None, the search starts from all `mode_candidates`.
         """
         event = len(self.event_shape)
         if self.log_weights.shape[-1] == 1:

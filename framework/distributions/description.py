@@ -9,7 +9,7 @@ from torch.distributions import Categorical, Distribution, constraints
 LONGEST = 200
 """Largest number of characters of the line that describes a density."""
 WHOLE = 6
-"""Largest number of elements up to which a parameter is printed in full; of a longer one, the range is printed."""
+"""Largest number of elements of a parameter that is printed in full; for a longer parameter, the range is printed."""
 
 
 def one_line(self: Distribution) -> str:

@@ -28,7 +28,7 @@ BLOCK = 7
 COARSEST = 8
 """Level of 2⁸ nodes on a circle, on which wide components are computed at all nodes."""
 FINEST = 2.0**36
-"""Largest index of a node; beyond it, rounding of angles would move nodes against the components."""
+"""Largest index of a node; at larger indices, rounding would shift the positions of nodes relative to components."""
 AT_ONCE = 2**13
 """Number of components that are evaluated at once."""
 

@@ -345,7 +345,10 @@ def highest_region(
 class Normals(NamedTuple):
     """A mixture of normals over one real number.
 
-    Its log-weights, means and standard deviations are (*batch, component), float64.
+    Attributes:
+        log_weights: logarithms of the weights, (*batch, component), float64.
+        mean: means of the normals, (*batch, component), float64.
+        scale: standard deviations of the normals, (*batch, component), float64.
     """
 
     log_weights: Tensor

@@ -42,7 +42,14 @@ class ObservedFrames(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """State of each flight at the first frame, its covariance, and half the final sum of squared residuals."""
+    """Estimated state of each flight at the first frame.
+
+    Attributes:
+        state: position (m), velocity (m/s) and spin (rad/s).
+        covariance: covariance of the state.
+        cost: half the final sum of squared residuals. These are the residuals of positions in standard deviations of
+            the noise, transformed by `cauchy`, and the state in standard deviations of the prior.
+    """
 
     state: Float[Tensor, "flight 9"]
     covariance: Float[Tensor, "flight 9 9"]
@@ -50,7 +57,13 @@ class Estimate(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """Prior density of a state: normal about 0, with standard deviations in m, m/s and rad/s."""
+    """Prior density of a state: normal about 0, independent in every number.
+
+    Attributes:
+        place: standard deviation of each coordinate of the position, m.
+        speed: standard deviation of each component of the velocity, m/s.
+        spin: standard deviation of each component of the spin, rad/s.
+    """
 
     place: float = 10.0
     speed: float = 10.0

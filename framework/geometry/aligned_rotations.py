@@ -34,10 +34,10 @@ REACH = 44.0
 """Exponent beyond which terms are neglected, since exp(-44) is less than half the last digit of float64."""
 NODES = (64, 48)
 PANEL = 4.0
-"""Length of the last of the two panels of a quadrature, in the variable of integration y.
+"""Length of the last of the two panels of the quadrature of k(λ), in its variable of integration y (`_quadrature`).
 
-The two panels have NODES nodes, 112 in all. With these the error of log k is at most 3e-14 for falls from 0 to 1e30
-(README of the plugin for matrix Fisher densities).
+NODES holds the numbers of nodes of the two panels, 112 in all. With these the error of log k is at most 3e-14 for falls
+from 0 to 1e30 (README of the plugin for matrix Fisher densities).
 """
 LARGE = 25.0
 """Concentration above which the asymptotic series of I₁/I₀ is exact to the last digit."""
@@ -93,7 +93,7 @@ def mean_rotation(parameter: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*bat
 def entropy(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
     """Return the entropy -E log p = log k(λ) + Σ λᵢ E qᵢ², nats; `falls` are λ.
 
-    It is with respect to the rotation-invariant measure of total mass 1, and therefore at most 0.
+    The density is with respect to the rotation-invariant measure of total mass 1. Its entropy is therefore at most 0.
     """
     return log_height(falls).neg() + (falls * second_moments(falls)).sum(-1)
 
@@ -251,7 +251,7 @@ def _quadrature(falls: Tensor) -> tuple[_Circle, _Circle, Tensor]:
 
 
 def legendre(count: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return nodes and weights of Gauss-Legendre quadrature on [0, 1]."""
+    """Return the `count` nodes and weights of Gauss-Legendre quadrature on [0, 1], float64, on `device`."""
     nodes, weights = _legendre_numbers(count)
     return torch.tensor(nodes, device=device), torch.tensor(weights, device=device)
 

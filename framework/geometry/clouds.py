@@ -232,13 +232,13 @@ def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> NormalisedC
 def near_middle(
     offset: Float[Tensor, "batch points 3"], real: Bool[Tensor, "batch points 1"] | None
 ) -> Bool[Tensor, "batch points 1"]:
-    """Return a mask of the points near the middle; the medians of the coordinates are the coordinates of the middle.
+    """Return a mask of the points near the middle of their cloud, the point with the median x, median y and median z.
 
     A point is near if its distance from the middle is at most `REACH` times the median of these distances. If half of
     the points or more are at the middle, all points count as near.
 
     Args:
-        offset: coordinates of the points.
+        offset: coordinates of the points, relative to any origin.
         real: mask of the rows that hold points; None if all do.
     """
     known = offset if real is None else offset.where(real, math.nan)

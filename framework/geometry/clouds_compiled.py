@@ -20,7 +20,7 @@ def unit_ball(clouds, counts, normalised, centre, scale):
     Args:
         clouds: (cloud, point, column) float32 or float64.
         counts: number of points of each cloud, int64.
-        normalised: filled with the normalised clouds, like `clouds`.
+        normalised: filled with the normalised clouds; shape and dtype of `clouds`.
         centre: filled with the centre of each cloud, (cloud, 3) float64.
         scale: filled with the scale of each cloud, (cloud,) float64.
     """

@@ -5,6 +5,9 @@ values. The position of a number in the vector is called a lane. `-`, `+`, `*`, 
 by lane on two values of one type. Vectors are LLVM's own, so that the compiler maps each to one, two or four registers
 of the processor. No function checks bounds.
 
+numba passes the first parameter of every intrinsic, `typing`; callers leave it out. While numba compiles, the other
+parameters of an intrinsic are the types of its arguments.
+
 The tests switch on type checks; `no_type_check` excludes functions that numba calls while it compiles.
 """
 
@@ -22,7 +25,10 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 LANES = 16
 INT32 = ir.IntType(32)
 Make = Callable[..., Any]
-"""Function that emits code for an operation: (builder, element type, values…) → resulting value."""
+"""Function that emits LLVM code for an operation: (builder, element type, values…) → resulting value.
+
+The builder is llvmlite's `IRBuilder`; the values are LLVM values, and the element type is numba's.
+"""
 
 
 class Lanes(types.Type):
@@ -62,8 +68,8 @@ def arithmetic(of_reals: str, of_integers: str) -> Make:
     """Return a function that emits an arithmetic operation on two vectors.
 
     Args:
-        of_reals: name of the builder's method for floating-point elements.
-        of_integers: name of the builder's method for integer elements.
+        of_reals: name of the method of `IRBuilder` for floating-point elements.
+        of_integers: name of the method of `IRBuilder` for integer elements.
     """
 
     def make(builder, element, x, y):
@@ -120,13 +126,13 @@ register(operator.ne, comparison("!="), compares=True)
 
 @no_type_check
 def least_of(builder, element, x, y):
-    """Emit the smaller number of x and y in each lane."""
+    """Emit code that computes the smaller number of x and y in each lane; y if x is NaN (a `Make`)."""
     return builder.select(comparison("<")(builder, element, x, y), x, y)
 
 
 @no_type_check
 def most_of(builder, element, x, y):
-    """Emit the larger number of x and y in each lane."""
+    """Emit code that computes the larger number of x and y in each lane; y if x is NaN (a `Make`)."""
     return builder.select(comparison(">")(builder, element, x, y), x, y)
 
 
@@ -170,7 +176,7 @@ def where(typing, truth, a, b):
 @intrinsic
 @no_type_check
 def fma(typing, a, b, c):
-    """Return a·b + c, rounded once if the processor can, otherwise after each step.
+    """Return a·b + c, rounded once if the processor has a fused multiply-add, otherwise after each step.
 
     All calls on one machine round in the same way.
     """
@@ -322,7 +328,14 @@ def with_id(typing, vector, number):
 
 @no_type_check
 def pointer(context, builder, sig, values):
-    """Return the address of element values[1] of the 1-D contiguous array values[0]."""
+    """Emit code for the address of an array element, and return the address.
+
+    Args:
+        context: numba's target context.
+        builder: llvmlite's `IRBuilder`.
+        sig: signature of the intrinsic, whose first argument is the array.
+        values: LLVM values of a contiguous array with one axis, and of the index of the element.
+    """
     array = context.make_array(sig.args[0])(context, builder, values[0])
     return builder.gep(array.data, [values[1]])
 

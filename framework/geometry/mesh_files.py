@@ -66,7 +66,7 @@ def text_lines(content: bytes, comment: bytes | None = b"#", names: Sequence[byt
         content: bytes of the file.
         comment: sign at which a comment begins, unless it stands within a number such as 1.#INF; None if there are no
             comments.
-        names: lines with one of these first words are kept whole, because the name after it may contain `comment`.
+        names: first words of lines that are kept whole, because the name after the first word may contain `comment`.
 
     Raises:
         ValueError: the text is UTF-16.

@@ -212,7 +212,7 @@ def _cross(mesh: Mesh) -> tuple[Float[np.ndarray, "3 faces"], Float[np.ndarray, 
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
-    """Return a generator of random numbers for one file; they do not depend on the files that were read before.
+    """Return a generator of random numbers for one file; its numbers do not depend on the files read before.
 
     Args:
         seed: seed of the run.

@@ -89,12 +89,13 @@ def noise_concentration(deviation: float) -> float:
 def log_blurred(
     first: Float[Tensor, "... 4"], second: Float[Tensor, "... 4"], group: str, concentration: float
 ) -> Float[Tensor, "..."]:
-    """Return the log-density at the rotation `second` of R g N, where R is `first`, g uniform in the group, N noise.
+    """Return the log-density of the random rotation R g N at `second`; R is `first`, g uniform in the group, N noise.
 
-    It is in nats with respect to the rotation-invariant measure of total mass 1, float64. N has the density exp(2κ cos
-    ω) / c of `noise_concentration`, with c = I₀(2κ) - I₁(2κ), the integral over ω with the measure (1 - cos ω) dω/π.
-    For a finite group, the density is the mean of the noise density over the group. For all rotations about z, let β be
-    the angle between the z axes of both rotations: the mean over the group is the integral
+    The result is in nats with respect to the rotation-invariant measure of total mass 1, float64. N has the density
+    exp(2κ cos ω) / c of `noise_concentration`, with κ = `concentration` and c = I₀(2κ) - I₁(2κ), the integral over ω
+    with the measure (1 - cos ω) dω/π. For a finite group, the density is the mean of the noise density over the group.
+    For all rotations about z, let β be the angle between the z axes of both rotations: the mean over the group is the
+    integral
 
         ∫ exp(2κ (cos²(β/2) (1 + cos θ) - 1)) dθ/2π / c = exp(-2κ sin²(β/2)) I₀(2κ cos²(β/2)) / c.
 

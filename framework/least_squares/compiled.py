@@ -1,13 +1,7 @@
 """One step of many small least-squares problems on one CPU core; compiled functions on NumPy arrays.
 
-framework.least_squares.solver explains the method. Its class `_Active` describes the state of the problems, and
-`compute_steps` describes the arrays of a step. The first dimension of every array is the problem, and p is the number
-of parameters of a problem. All functions share these names:
-    at (the parameters), lower, upper (their bounds), gradient, scale, move: (problem, p) float64.
-    gram, curve: (problem, p, p) float64.
-    cost, damping, gain, slope, least: (problem,) float64.
-    cut, careful: (problem,) bool.
-    streak, quiet, steps, ended: (problem,) int64.
+framework.least_squares.solver explains the method. The first dimension of every array is the problem, and p is the
+number of parameters of a problem. J is the Jacobian of the residuals r of a problem. Real arrays are float64.
 """
 
 from pathlib import Path
@@ -43,8 +37,13 @@ GOES_ON, LIMIT, STEP, COST, GRADIENT = 10, 0, 3, 2, 1
 def factorise(normal, fixed, damping, factor):
     """Fill `factor` with the lower Cholesky factor of `normal` + `damping` · identity, and return its smallest pivot.
 
-    Rows and columns of parameters that are `fixed` are replaced by rows and columns of the identity matrix. The
-    function returns NaN if the matrix is not positive definite.
+    The pivots are the diagonal elements of the factor. The function returns NaN if the matrix is not positive definite.
+
+    Args:
+        normal: matrix of one problem, (p, p); only the lower triangle is read.
+        fixed: true for each parameter whose row and column are replaced by those of the identity matrix, (p,).
+        damping: number that is added to the diagonal.
+        factor: filled with the factor, (p, p); the upper triangle is not written.
     """
     size = normal.shape[0]
     least = np.inf
@@ -73,7 +72,7 @@ def factorise(normal, fixed, damping, factor):
 @compiled
 @no_type_check
 def solve(factor, right):
-    """Solve L Lᵀ x = `right`, where L is the Cholesky factor `factor`; x overwrites `right`."""
+    """Solve L Lᵀ x = `right`, (p,), where L is the Cholesky factor `factor`, (p, p); x overwrites `right`."""
     size = factor.shape[0]
     for row in range(size):
         total = right[row]
@@ -94,10 +93,23 @@ def compute_steps(
 ):
     """Compute the damped step of every problem within its bounds, and fill the arrays that describe it.
 
-    `move` is the step. `gain` is the expected decrease of the cost. `slope` is the largest cosine of the angle between
-    the residuals and a column of the Jacobian. `least` is the square of the smallest pivot of the Cholesky factor.
-    `cut` is true if a bound made the step shorter. `careful` is true if the normal matrix has lost digits that the
-    Jacobian still has, so that the step must be computed from the Jacobian.
+    Args:
+        at: parameters, (problem, p).
+        lower: lower bounds of the parameters, (problem, p).
+        upper: upper bounds of the parameters, (problem, p).
+        cost: half the sum of squared residuals, (problem,).
+        gradient: Jᵀr, (problem, p).
+        gram: JᵀJ, (problem, p, p).
+        curve: difference between the Hessian of the cost and JᵀJ, 0 far from the minimum, (problem, p, p).
+        scale: largest length so far of each column of J, (problem, p).
+        damping: damping in units of the square of `scale`, (problem,).
+        move: filled with the step, (problem, p).
+        gain: filled with the expected decrease of the cost, (problem,).
+        slope: filled with the largest cosine of the angle between the residuals and a column of J, (problem,).
+        least: filled with the square of the smallest pivot of the Cholesky factor, (problem,).
+        cut: filled with true where a bound made the step shorter, (problem,).
+        careful: filled with true where the normal matrix has lost digits that J still has, so that the step must be
+            computed from J, (problem,).
     """
     count, size = at.shape
     normal, factor = np.empty((size, size)), np.empty((size, size))
@@ -181,10 +193,33 @@ def judge_steps(
 ):  # fmt: skip
     """Accept or reject the step of every problem, and update the state of the problem accordingly.
 
-    `tried` are the parameters after the step, and `new_cost`, `new_gradient` and `new_gram` the values there. `most`,
-    `decrease` and `shortest` are the settings `most`, `decrease` and `step` of the solver. The function fills `ended`
-    with GOES_ON or with the status of a problem that has ended, and `near` with whether the minimum is near, so that
-    the second derivatives are needed.
+    Args:
+        at: parameters, as for `compute_steps`; updated.
+        cost: as for `compute_steps`; updated.
+        gradient: as for `compute_steps`; updated.
+        gram: as for `compute_steps`; updated.
+        curve: as for `compute_steps`; set to 0 if the step is accepted.
+        scale: as for `compute_steps`; updated.
+        damping: as for `compute_steps`; updated.
+        streak: number of successive steps that lowered the damping, or minus the number of successive rejected steps,
+            (problem,); updated.
+        quiet: number of successive steps with a gain that is negligible or smaller than rounding errors, (problem,);
+            updated.
+        steps: number of steps tried, (problem,); updated.
+        move: step, as `compute_steps` filled it, and so are the next four arguments.
+        gain: expected decrease of the cost.
+        slope: largest cosine of the angle between the residuals and a column of J.
+        least: square of the smallest pivot of the Cholesky factor.
+        cut: true where a bound made the step shorter.
+        tried: parameters after the step, (problem, p).
+        new_cost: cost at `tried`.
+        new_gradient: gradient at `tried`.
+        new_gram: JᵀJ at `tried`.
+        most: largest number of steps, an argument of `least_squares`.
+        decrease: smallest relative decrease of the cost, an argument of `least_squares`.
+        shortest: smallest relative step, the argument `step` of `least_squares`.
+        ended: filled with GOES_ON, or with the status of a problem that has ended, (problem,).
+        near: filled with true where the minimum is near, so that second derivatives are needed, (problem,).
     """
     count, size = at.shape
     for problem in range(count):
@@ -242,10 +277,15 @@ def judge_steps(
 @compiled
 @no_type_check
 def invert(gram, inverse, trace):
-    """Fill `inverse` with the inverse of each matrix in `gram`, and `trace` with the trace of an inverse.
+    """Fill `inverse` with the inverse of each matrix in `gram`, and `trace` with the trace of a scaled inverse.
 
-    For the trace, rows and columns of the matrix are first scaled so that its diagonal is 1. It is NaN
-    if the matrix has no inverse.
+    For the trace, rows and columns of the matrix are first scaled so that its diagonal is 1. The trace is NaN if the
+    matrix has no inverse; the matrix in `inverse` is then not written.
+
+    Args:
+        gram: JᵀJ, (problem, p, p).
+        inverse: filled with the inverses, (problem, p, p).
+        trace: filled with the traces, (problem,).
     """
     count, size = gram.shape[0], gram.shape[1]
     normal, factor = np.empty((size, size)), np.empty((size, size))

@@ -22,9 +22,18 @@ compiled = compiler(kernel_cache("spectra", [Path(__file__)]), fastmath={"reasso
 @compiled
 @no_type_check
 def evaluate_lines(parameters, measured, offsets, centres, jacobian, residuals):
-    """Fill `jacobian` (p, offset) and `residuals` (offset,) of one spectrum, and return the number of measured offsets.
+    """Compute the residuals Z - measured of one spectrum and their Jacobian; return the number of measured offsets.
 
-    `jacobian` and `residuals` are 0 at offsets where nothing was measured.
+    Residuals and Jacobian are 0 at offsets where nothing was measured.
+
+    Args:
+        parameters: parameters of the spectrum, (p,).
+        measured: measured Z, (offset,), NaN where nothing was measured.
+        offsets: offsets, (offset,), ppm.
+        centres: centres of the pools, (pool,), ppm from water. With the preset "fifteen", only their number is used,
+            because `parameters` holds the centres.
+        jacobian: filled with the derivatives of the residuals, (p, offset).
+        residuals: filled with the residuals, (offset,).
     """
     pools, size, count = centres.shape[0], parameters.shape[0], offsets.shape[0]
     shift = 2 * pools
@@ -65,8 +74,18 @@ def evaluate_lines(parameters, measured, offsets, centres, jacobian, residuals):
 def compute_sums(parameters, rows, measured, offsets, centres, cost, gradient, gram, measured_counts):
     """Fill arrays with sums over the offsets of each spectrum, for the residuals r and their Jacobian J.
 
-    `cost` (spectrum,) is half the sum of squared residuals, `gradient` (spectrum, p) is Jᵀr, `gram` (spectrum, p, p) is
-    JᵀJ, and `measured_counts` (spectrum,) is the number of measured offsets.
+    The module's description lists the first five arguments.
+
+    Args:
+        parameters: parameters of the spectra.
+        rows: row of each spectrum in `measured`.
+        measured: measured Z.
+        offsets: offsets.
+        centres: centres of the pools.
+        cost: filled with half the sum of squared residuals, (spectrum,).
+        gradient: filled with Jᵀr, (spectrum, p).
+        gram: filled with JᵀJ, (spectrum, p, p).
+        measured_counts: filled with the number of measured offsets, (spectrum,).
     """
     size = parameters.shape[1]
     jacobian, residuals = np.empty((size, offsets.shape[0])), np.empty(offsets.shape[0])
@@ -95,7 +114,7 @@ def compute_sums(parameters, rows, measured, offsets, centres, cost, gradient, g
 def compute_curvature(parameters, rows, measured, offsets, centres, curvature):
     """Fill `curvature` (spectrum, p, p) with the sum over the offsets of the residual times ∇²Z.
 
-    ∇²Z is the matrix of second derivatives of Z by the parameters.
+    ∇²Z is the matrix of second derivatives of Z by the parameters. The module's description lists the arguments.
     """
     pools, size, count = centres.shape[0], parameters.shape[1], offsets.shape[0]
     shift = 2 * pools

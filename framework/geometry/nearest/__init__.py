@@ -300,10 +300,14 @@ def on_device(clouds: Tensor, points: Tensor, sizes: Tensor | None, query_sizes:
 
 
 def scaling(cloud: Tensor, queries: Tensor) -> float:
-    """Return a power of two that scales the largest coordinate of a cloud and its queries to about 1.
+    """Return the power of two by which coordinates are multiplied, so that the largest magnitude is about 1.
 
     Multiplying by a power of two is exact. If the required exponent is too large for the dtype (`exponents.MOST`), the
-    closest allowed power is returned, and `nearest` scales again.
+    closest allowed power is returned. `nearest` then finds that the scaled coordinates need scaling, and scales again.
+
+    Args:
+        cloud: (points, 3).
+        queries: (query, 3), of the dtype of `cloud`.
     """
     largest = max(float(cloud.abs().max()), float(queries.abs().max()))
     return 2.0 ** max(-MOST[cloud.dtype], min(MOST[cloud.dtype], -math.frexp(largest)[1]))

@@ -212,7 +212,7 @@ def extent(cloud, size, box):
 @inlined
 @no_type_check
 def cells_per_unit(size, grid, real):
-    """Return the number of cells per unit of length, with which the highest coordinate is in the last cell.
+    """Return the number of cells per unit of length, chosen so that the highest coordinate is in the last cell.
 
     If the extent is at most FLAT, the number is 0, and all points are in one cell.
 
@@ -227,15 +227,15 @@ def cells_per_unit(size, grid, real):
 @compiled
 @no_type_check
 def histogram(cloud, box, bits, begin, end, key, count):
-    """Write the cell of each point from `begin`, a multiple of 16, to `end`, and the number of points in each cell.
+    """Write the cells of the points begin…end to `key`, and the number of these points in each cell to `count`.
 
     Args:
         cloud: flat array.
         box: lowest and highest coordinates of the whole cloud.
         bits: the grid has 2^bits cells along each axis.
-        begin: index of the first point.
+        begin: index of the first point, a multiple of 16.
         end: index after the last point.
-        key: filled with the cell of each point.
+        key: filled with the number of the cell of each point (see `curve`).
         count: filled with the number of points in each cell.
     """
     grid = np.int32(1 << bits)
@@ -261,10 +261,10 @@ def histogram(cloud, box, bits, begin, end, key, count):
 @compiled
 @no_type_check
 def places(count, bits, cells, crowded):
-    """Replace the numbers of points in cells by the positions at which their first points are stored.
+    """Compute at which position of the sorted points each thread stores its first point of each cell.
 
     Args:
-        count: number of points of each thread in each cell, (threads, cells); replaced.
+        count: number of points that each thread counted in each cell, (threads, cells); replaced by the positions.
         bits: the grid has 2^bits cells along each axis.
         cells: cells in the order of the Hilbert curve, as `curve` returns them.
         crowded: filled with begin and end of each cell with more than CROWD points.
@@ -379,6 +379,12 @@ def box_leaves(packed, size, begin, end):
     """Turn the records of the leaves begin…end into 16 x, 16 y, 16 z and 16 ids, and compute the boxes of these leaves.
 
     If the last leaf is among them, it is first filled with copies of the last point.
+
+    Args:
+        packed: the packed cloud, whose `points` hold records; changed in place.
+        size: number of points of the cloud.
+        begin: index of the first leaf.
+        end: index after the last leaf.
     """
     points, ids, box, low, _ = packed
     nodes = box.shape[0] // 6

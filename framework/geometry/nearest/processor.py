@@ -81,10 +81,14 @@ class Problem(NamedTuple):
 @compiled
 @no_type_check
 def worth_packing(size, packets):
-    """Return true if a cloud of `size` points is searched faster after it is packed, for `packets` packets of queries.
+    """Return true if a cloud should be packed before the search, because this is faster in total.
 
     As measured, packing a cloud costs as much as comparing it with three packets, and the search for a packet in a
     packed cloud costs as much as comparing it with a few hundred points.
+
+    Args:
+        size: number of points of the cloud.
+        packets: number of packets of queries.
     """
     return packets > 3 and size * packets > 8192
 
@@ -148,9 +152,17 @@ def search_clouds(problem, begin, end, cells, work, packed, own):
 @compiled
 @no_type_check
 def search_clouds_share(problem, counter, step, limit, cells, work, packed, own):
-    """Search a part of a batch in one thread, `step` clouds at a time, until it has searched `limit` or none are left.
+    """Search a part of a batch in one thread, until it has searched `limit` clouds or no cloud is left.
 
-    The threads share `counter`, the index of the next cloud. The other arguments are those of `search_clouds`.
+    Args:
+        problem: the batch.
+        counter: index of the next cloud, (1,) int64, which all threads share and increase.
+        step: number of clouds that a thread takes at a time.
+        limit: number of clouds after which this call ends.
+        cells: as for `search_clouds`.
+        work: as for `search_clouds`.
+        packed: as for `search_clouds`.
+        own: as for `search_clouds`.
     """
     batch = problem.sizes.shape[0]
     searched = 0
@@ -165,9 +177,15 @@ def search_clouds_share(problem, counter, step, limit, cells, work, packed, own)
 @compiled
 @no_type_check
 def search_share(packed, packets, counter, step, distance, index):
-    """Search a packed cloud for a part of the packets in one thread, `step` packets at a time, until none are left.
+    """Find the nearest points to a part of the packets in one thread, until no packet is left.
 
-    The threads share `counter`, the index of the next packet.
+    Args:
+        packed: the cloud.
+        packets: packed queries.
+        counter: index of the next packet, (1,) int64, which all threads share and increase.
+        step: number of packets that a thread takes at a time.
+        distance: filled as by `search.search`.
+        index: filled as by `search.search`.
     """
     number = packets.levels[8]
     while True:
@@ -180,7 +198,17 @@ def search_share(packed, packets, counter, step, distance, index):
 @compiled
 @no_type_check
 def search_all_share(cloud, size, packets, counter, step, distance, index):
-    """Search a cloud that is not packed for a part of the packets in one thread, as `search_share` does."""
+    """Do the same as `search_share` for a cloud that is not packed.
+
+    Args:
+        cloud: coordinates of the points, flat array.
+        size: number of points.
+        packets: as for `search_share`.
+        counter: as for `search_share`.
+        step: as for `search_share`.
+        distance: as for `search_share`.
+        index: as for `search_share`.
+    """
     number = packets.levels[8]
     while True:
         begin = fetch_and_add(counter, step)
@@ -356,7 +384,14 @@ def search_batch(
 
 
 def solve_one(problem: Problem, i: int, cells: NDArray[np.int32], threads: int) -> None:
-    """Search cloud i, which is large or has many queries, in several threads; one thread gives the same numbers."""
+    """Search one cloud, which is large or has many queries, in several threads; one thread gives the same numbers.
+
+    Args:
+        problem: the batch, with packed queries; its distances, indices and outcome of cloud i are filled.
+        i: index of the cloud in the batch.
+        cells: cells in the order of the Hilbert curve, as `curve` returns them.
+        threads: number of threads.
+    """
     cloud, size = problem.clouds[i], int(problem.sizes[i])
     box = extent_together(cloud, size, threads)
     if box is None:

@@ -3,9 +3,9 @@
 The queries are packed too (`pack`). Sixteen neighbouring queries, a leaf of the packed queries, walk through the
 cloud's tree together. Each query has a smallest distance so far. A node is opened if the distance from its box to the
 box of the sixteen queries is at most the largest of these sixteen distances. Then the boxes of its children are
-compared with each query. If only a few of the sixteen
-queries need a child, each of these queries continues alone, and is compared with sixteen boxes or points at a time. The
-first guesses are the nearest points of the previous sixteen queries, or points found by `descend` in a large cloud.
+compared with each query. If only a few of the sixteen queries need a child, each of these queries continues alone, and
+is compared with sixteen boxes or points at a time. The first guesses are the nearest points of the previous sixteen
+queries, or points found by `descend` in a large cloud.
 
 No tolerance is needed. A box's squared distance is computed by the same operations as a point's, and each of these
 rounds monotonically. So the rounded distance of a box is not larger than the rounded distance of any point in the box.
@@ -63,7 +63,15 @@ def squared_length(x, y, z):
 @inlined
 @no_type_check
 def interval_distance(low, high, query_low, query_high, zero):
-    """Return the distance between the intervals low…high and query_low…query_high, 0 if they overlap."""
+    """Return the distance between two intervals in each lane, 0 where they overlap.
+
+    Args:
+        low: lower ends of the first intervals.
+        high: upper ends of the first intervals.
+        query_low: lower ends of the second intervals.
+        query_high: upper ends of the second intervals.
+        zero: 0 in all lanes.
+    """
     return most(zero, most(low - query_high, query_low - high))
 
 
@@ -454,6 +462,15 @@ def search_all(cloud, size, packets, begin, end, distance, index):
     """Write the same results as `search`, by comparing every query with every point of a cloud that is not packed.
 
     This is faster for small clouds or few queries.
+
+    Args:
+        cloud: coordinates of the points, flat array.
+        size: number of points.
+        packets: packed queries.
+        begin: index of the first packet.
+        end: index after the last packet.
+        distance: as for `search`.
+        index: as for `search`.
     """
     queries = packets.points
     blocks = (size + 15) // 16

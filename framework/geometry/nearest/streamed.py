@@ -39,6 +39,9 @@ class Stream:
     """Search for the nearest points in a cloud that is read in chunks.
 
     On one device, the results equal those of `nearest` for the whole cloud exactly.
+
+    Args:
+        queries: (query, 3), or the result of `prepare`.
     """
 
     def __init__(self, queries: Float[Tensor, "query 3"] | Queries) -> None:
