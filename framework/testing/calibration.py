@@ -1,4 +1,7 @@
-"""Checks of the calibration of an uncertainty wrapper: no loss of likelihood, and use of all validation data."""
+"""Checks of the calibration of an uncertainty wrapper: no loss of likelihood, and use of all validation data.
+
+Each check records its errors in `worst` (`framework.testing.finding.Worst`), which keeps the largest one.
+"""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass

@@ -1,4 +1,8 @@
-"""Additional checks of encoders of point clouds."""
+"""Additional checks of encoders of point clouds.
+
+The argument `make` of a check is a function that returns a new encoder. `clouds` are point clouds (points, columns)
+that the encoder can read. Errors are recorded in `worst` (`framework.testing.finding.Worst`), which keeps the largest.
+"""
 
 import math
 from collections.abc import Callable, Sequence

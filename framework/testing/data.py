@@ -52,7 +52,12 @@ MINUTES = 5.0
 
 
 def examine_data(row: DataRow, build: Build) -> Iterator[Finding]:
-    """Yield one finding for each property of a data set, or only the first if the data set cannot be prepared."""
+    """Yield one finding for each property of a data set, or only the first if the data set cannot be prepared.
+
+    Args:
+        row: Contract row of the data set.
+        build: Function that returns the data set for given parameters, without preparing it.
+    """
     with TemporaryDirectory() as scratch:
         bench = Workbench(row, build, Path(scratch))
         checks: dict[str, tuple[float, Check]] = {

@@ -1,4 +1,8 @@
-"""Checks of a data set's files: a missing root, damaged files, and a user's own files."""
+"""Checks of a data set's files: a missing root, damaged files, and a user's own files.
+
+The argument `bench` of a check builds and prepares the data set (`framework.testing.data_folders.Workbench`). Errors
+are recorded in `worst` (`framework.testing.finding.Worst`), which keeps the largest one.
+"""
 
 import io
 import math

@@ -76,6 +76,10 @@ def list_folders_backwards() -> Iterator[None]:
 class Workspace:
     """Folder for one preparation of a data set.
 
+    Args:
+        row: Contract row of the data set, whose `write` writes files to the folder.
+        folder: The folder.
+
     Attributes:
         files: Folder of the files that the row's `write` wrote; empty for generated data.
         cache: Folder for generated data.

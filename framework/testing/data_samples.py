@@ -1,4 +1,8 @@
-"""Choice of the samples of a split to check, and comparisons of samples to the last bit."""
+"""Choice of the samples of a split to check, and comparisons of samples to the last bit.
+
+A comparison records an error for each difference in `worst` (`framework.testing.finding.Worst`). Its argument `label`
+describes the compared samples in the finding.
+"""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence

@@ -28,6 +28,10 @@ def check_targets_belong(data: Data, worst: Worst) -> None:
 
     A target is predicted by the median target of the samples with the nearest inputs. If inputs do not predict their
     own targets, they must not predict the targets of the previous or the next sample either.
+
+    Args:
+        data: Prepared data set.
+        worst: Recorder of the largest error.
     """
     for name, split in splits_by_name(data).items():
         indices = indices_to_check(split)[:MOST]

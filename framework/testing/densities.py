@@ -1,4 +1,7 @@
-"""Checks of the densities of density heads and uncertainty wrappers; each check records its largest error."""
+"""Checks of the densities of density heads and uncertainty wrappers; each check records its largest error.
+
+A check is a function of a density and of `worst`, which records the largest error (`framework.testing.finding.Worst`).
+"""
 
 import math
 from collections.abc import Callable, Iterator

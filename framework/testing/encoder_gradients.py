@@ -32,6 +32,12 @@ def check_parameter_gradients(make: Make, inputs: Inputs, worst: Worst, *, slow:
     several step lengths, the one with the smallest error counts, since no step agrees with a wrong gradient. The check
     runs in evaluation mode and, unless the encoder is slow, in training mode. In training, batch norm over few samples
     makes the loss of a slow, deep network too nonlinear for differences.
+
+    Args:
+        make: Function that returns a new encoder.
+        inputs: Function from a number of samples to inputs of the encoder.
+        worst: Recorder of the largest error.
+        slow: True if the encoder is slow; fewer groups of parameters are then checked.
     """
     for training, count in ((False, 2),) if slow else ((True, 6), (False, 3)):
         encoder = make().double().train(training)

@@ -1,4 +1,7 @@
-"""Check that a renderer draws extreme scenes correctly, with finite gradients."""
+"""Check that a renderer draws extreme scenes correctly, with finite gradients.
+
+Errors are recorded in `worst` (`framework.testing.finding.Worst`), which keeps the largest one.
+"""
 
 import math
 from dataclasses import replace
@@ -29,7 +32,7 @@ def extremes(renderer: Renderer, worst: Worst) -> None:
 
 
 def check_gradients(renderer: Renderer, scene: Scene, name: str, worst: Worst) -> None:
-    """Check that the colours of a scene and their gradients in its parameters are finite."""
+    """Check that the colours of a scene and their gradients in its parameters are finite; `name` names the scene."""
     view = scene.camera
     parts = {
         "vertices": scene.vertices,

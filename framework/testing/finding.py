@@ -91,14 +91,14 @@ class Worst:
         self.record(float(wrong.sum()) if isinstance(wrong, Tensor) else float(wrong), case)
 
     def same(self, label: str, actual: object, expected: object) -> None:
-        """Record an error of 1 if two objects, such as shapes or types, differ, else 0."""
+        """Record an error of 1 if two objects, such as shapes or types, differ, else 0; `label` names the objects."""
         different = actual != expected
         self.count(different, f"{label}: {actual}" + (f", expected {expected}" if different else ""))
 
     def same_bits(self, label: str, actual: Tensor, expected: Tensor) -> None:
         """Record the largest difference of two tensors that must be equal to the last bit; NaN equals NaN.
 
-        The error is infinite if their shapes or types differ.
+        The error is infinite if their shapes or types differ. `label` names the tensors in the finding.
         """
         if actual.shape != expected.shape or actual.dtype != expected.dtype:
             self.record(
@@ -116,7 +116,7 @@ class Worst:
         self.record(gap.where(~equal, 0), label)
 
     def finite(self, label: str, values: Tensor) -> None:
-        """Record the number of values that are NaN or infinite."""
+        """Record the number of values that are NaN or infinite as the error; `label` names the values."""
         self.count(
             ~values.isfinite(), f"{label}: {int((~values.isfinite()).sum())} of {values.numel()} not finite"
         )

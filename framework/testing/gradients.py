@@ -1,4 +1,8 @@
-"""Checks of the gradients of a head's loss: finite differences, and a mean of zero over draws from the density."""
+"""Checks of the gradients of a head's loss: finite differences, and a mean of zero over draws from the density.
+
+The argument `subject` of a check is the head under test (`framework.testing.head_subject.HeadSubject`). Errors are
+recorded in `worst` (`framework.testing.finding.Worst`), which keeps the largest one.
+"""
 
 import math
 from collections.abc import Callable, Iterator, Sequence

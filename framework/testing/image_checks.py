@@ -1,4 +1,7 @@
-"""Checks of a renderer's images: against brute-force ray casting, for batches of scenes, and for sets of points."""
+"""Checks of a renderer's images: against brute-force ray casting, for batches of scenes, and for sets of points.
+
+Each check records its errors in `worst` (`framework.testing.finding.Worst`), which keeps the largest one.
+"""
 
 import math
 from collections.abc import Sequence

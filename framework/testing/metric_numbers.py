@@ -80,7 +80,14 @@ def _gap(first: float, second: float) -> float:
 
 
 def check_same(label: str, actual: Numbers, expected: Numbers, worst: Worst) -> None:
-    """Check that numbers are equal; the error is relative to values above 1, and NaN equals NaN."""
+    """Check that numbers are equal; the error is relative to values above 1, and NaN equals NaN.
+
+    Args:
+        label: Description of the comparison, for the finding.
+        actual: Numbers of the metric, by name.
+        expected: Numbers that they must equal.
+        worst: Recorder of the largest error.
+    """
     worst.same(f"{label}: keys", sorted(actual), sorted(expected))
     for key in actual.keys() & expected.keys():
         value, reference = actual[key].double(), expected[key].double()

@@ -151,7 +151,12 @@ def simplest_density(target: Target, place: Tensor, breadth: Tensor | None = Non
 
 
 def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
-    """Yield one finding for each property of a metric, for predictions of the row's target."""
+    """Yield one finding for each property of a metric, for predictions of the row's target.
+
+    Args:
+        row: Contract row of the metric.
+        build: Function that returns a new metric.
+    """
     reads = bool(build().reads)
     whole = predictions(row, SAMPLES, images=reads)
     many, kind = Many(build, row, images=reads), row.target.kind
@@ -327,6 +332,11 @@ def _compute_quietly(build: Make, predict: Predict, parts: Sequence[Tensor]) -> 
 
 class Many:
     """Many predictions, and the numbers that a metric computes from all of them.
+
+    Args:
+        build: Function that returns a new metric.
+        row: Contract row of the metric.
+        images: True if the predictions have images.
 
     Attributes:
         predictions: Predictions.

@@ -35,6 +35,8 @@ DRAWS = 8
 class Network(nn.Module):
     """Small network with batch norm, which has state, and dropout, which draws random numbers.
 
+    Its outputs are the parameters of `simplest_density` for the given target.
+
     Attributes:
         gain: Factor on the raw parameters, which can make them extreme.
     """
@@ -85,7 +87,12 @@ class Members(Predictor):
 
 
 def examine_objective(row: ObjectiveRow, build: Make) -> Iterator[Finding]:
-    """Yield one finding for each property of an objective, checked on small predictors of the row's target."""
+    """Yield one finding for each property of an objective, checked on small predictors of the row's target.
+
+    Args:
+        row: Contract row of the objective.
+        build: Function that builds the objective, as `Make`.
+    """
     checks: dict[str, tuple[float, Callable[[Worst], None]]] = {
         "on the device of its inputs": (0.0, lambda worst: _on_one_device(build, row, worst)),
         "a finite scalar": (0.0, lambda worst: _scalar(build, row, worst)),
@@ -141,7 +148,7 @@ def in_float64(batch: Batch) -> Batch:
 
 
 def penalty(objective: Objective, predictor: Predictor, batch: Batch) -> Tensor:
-    """Return the penalty with a fixed random seed."""
+    """Return the penalty of an objective on a batch, with a fixed random seed."""
     torch.manual_seed(SEED)
     return objective(predictor, batch)
 

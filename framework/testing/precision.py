@@ -1,4 +1,8 @@
-"""Checks of the accuracy of a head's log-densities: the row's reference cases, and float32 compared with float64."""
+"""Checks of the accuracy of a head's log-densities: the row's reference cases, and float32 compared with float64.
+
+The argument `subject` of a check is the head under test (`framework.testing.head_subject.HeadSubject`). Errors are
+recorded in `worst` (`framework.testing.finding.Worst`), which keeps the largest one.
+"""
 
 import copy
 import math

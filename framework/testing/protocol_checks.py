@@ -1,4 +1,7 @@
-"""Checks of the optional functions of framework.distributions.protocol: comparison with log_prob and with draws."""
+"""Checks of the optional functions of framework.distributions.protocol: comparison with log_prob and with draws.
+
+Each check records its errors in `worst` (`framework.testing.finding.Worst`), which keeps the largest one.
+"""
 
 import math
 from collections.abc import Callable, Iterator

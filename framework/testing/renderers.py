@@ -30,7 +30,12 @@ OF_TRIANGLES = {"no holes", "sphere: depth, metres", "faces cut by the near plan
 
 
 def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:
-    """Yield one finding for each property of a renderer."""
+    """Yield one finding for each property of a renderer.
+
+    Args:
+        row: Contract row of the renderer.
+        build: Function that returns a new renderer with the row's parameters.
+    """
     checks: dict[str, tuple[float, Callable[[Renderer, Worst], None]]] = {
         "only the requested channels": (0.0, _channels),
         "scenes that cannot be drawn are refused": (0.0, _refusals),

@@ -1,4 +1,7 @@
-"""Checks of a renderer's normals, barycentric coordinates, textures and gradients."""
+"""Checks of a renderer's normals, barycentric coordinates, textures and gradients.
+
+Each check records its errors in `worst` (`framework.testing.finding.Worst`), which keeps the largest one.
+"""
 
 from dataclasses import replace
 

@@ -32,6 +32,10 @@ def units(subject: HeadSubject, worst: Worst) -> None:
 
     Here y is a value, and p is the density that the head returns for a target without location and scale. A head also
     passes if it ignores location and scale, and returns the same density as without them.
+
+    Args:
+        subject: Head under test.
+        worst: Recorder of the largest error.
     """
     head = subject.make()
     if head.direct or isinstance(head, Fitted):
