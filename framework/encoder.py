@@ -81,7 +81,7 @@ class FitsInputs(ABC):
 
 
 def require_numbers(input_shape: tuple[int, ...], by: str) -> int:
-    """Return the number of elements of a sample of shape `input_shape`.
+    """Return the number of elements of a sample of shape `input_shape`; `by` is the caller's name for the message.
 
     Raises:
         ConfigError: a sample of this shape has no elements.
@@ -96,7 +96,12 @@ def require_numbers(input_shape: tuple[int, ...], by: str) -> int:
 
 
 def require_grey_or_color(input_shape: tuple[int, ...], by: str, smallest: int = 0) -> None:
-    """Require grey or colour images, with sides of at least `smallest` pixels.
+    """Require that the inputs are grey or colour images, with sides of at least `smallest` pixels.
+
+    Args:
+        input_shape: shape of one input; (channels, height, width) for images.
+        by: name of the encoder, for the message.
+        smallest: smallest height and width, pixels.
 
     Raises:
         ConfigError: the input is not an image of 1 or 3 channels, or it is too small.

@@ -103,6 +103,11 @@ def nearest_name(word: str, known: Iterable[str], likeness: float = LEAST_SIMILA
     """Return the name most similar to `word`, or None if no name is similar.
 
     'lr' is similar to learning_rate, and 'moons' to moons/everything.
+
+    Args:
+        word: word that is not the name of anything.
+        known: names to choose from.
+        likeness: smallest similarity of two words, from 0 to 1 (`difflib.SequenceMatcher.ratio`).
     """
     word, names = shorten(word), list(islice(known, 1000))
     near = get_close_matches(word, names, n=1, cutoff=likeness)
@@ -131,6 +136,9 @@ def list_names(word: str, known: Iterable[str]) -> str:
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return ' Did you mean ...?' with a leading space, or "" if no name is similar."""
+    """Return ' Did you mean ...?' with the name in `known` most similar to `word`, or "" if no name is similar.
+
+    The text begins with a space, so that it can be appended to a message.
+    """
     near = nearest_name(word, known)
     return f" Did you mean {quote(near)}?" if near else ""

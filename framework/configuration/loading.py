@@ -70,7 +70,10 @@ class User:
         self.frames = WeakTensorKeyDictionary()  # frames of the inputs of the calls in progress
 
     def convert_inputs(self, model: nn.Module, arguments: tuple[Any]) -> Tensor:
-        """Return the model's inputs for a user's data, and store the result of `Data.frame` for `convert_density`."""
+        """Return the model's inputs for a user's data, and store the result of `Data.frame` for `convert_density`.
+
+        This is a forward pre-hook of torch: `arguments` are the arguments of a call of the model, one in number.
+        """
         batch = read_batch(model, self.data, *arguments)
         self.frames[batch["input"]] = self.data.frame(batch)
         return batch["input"]

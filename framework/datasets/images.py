@@ -355,6 +355,10 @@ class Crops(Dataset[dict[str, Tensor]]):
     """Data set that reads each crop from its file when the sample is indexed; the other fields are in memory.
 
     Indexing raises a DataError if the file cannot be read.
+
+    Args:
+        crops: the crops, one for each sample.
+        fields: the other fields of all samples, by name; the first dimension is the sample.
     """
 
     def __init__(self, crops: Sequence[Crop], **fields: Tensor) -> None:

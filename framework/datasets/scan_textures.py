@@ -1,4 +1,4 @@
-"""Textures of the subjects in a folder of `human_scans`, for the meshes of these subjects."""
+"""Textures of scanned people, for their registered meshes (`framework.datasets.scan_layout`)."""
 
 import hashlib
 from functools import lru_cache

@@ -130,7 +130,7 @@ class Exporting:
 
     @torch.no_grad()
     def accepted_arrays(self, count: int, spread: float) -> Tensor:
-        """Return random arrays that the model accepts.
+        """Return `count` random arrays that the model accepts; `spread` is as in `arrays`.
 
         An encoder may refuse random point clouds, because they are not in the unit ball. Every point is then moved to
         one of the eight corners of a cube in this ball, so that most points are equal.
@@ -155,7 +155,12 @@ class Exporting:
 
     @torch.no_grad()
     def form(self, arrays: Tensor, noise: Sequence[Tensor | None] | None = None) -> Exported:
-        """Return the parameters of the original model's densities, computed with given random numbers."""
+        """Return the original model's densities as tensors (`exported`).
+
+        Args:
+            arrays: the user's arrays, (batch, *input_shape).
+            noise: arrays that replace the random numbers of the model, as for `given_draws`.
+        """
         with given_draws(noise):
             return exported(self.density(arrays))
 
@@ -178,7 +183,12 @@ class Traced(nn.Module):
         self.used = used
 
     def forward(self, arrays: Tensor, noise: Sequence[Tensor] = ()) -> tuple[Tensor, ...]:
-        """Return the parameters of the density, in the order of `Exported.tensors`."""
+        """Return the parameters of the density, in the order of `Exported.tensors`.
+
+        Args:
+            arrays: the user's arrays, (batch, *input_shape).
+            noise: arrays of random numbers, for those draws of the model that `used` marks.
+        """
         parts = iter(noise)
         with given_draws([next(parts) if needed else None for needed in self.used]):
             form = exported(self.predictor(self.preprocessing(arrays).to(self.kind)))
@@ -493,7 +503,13 @@ def _rounding(
 
 
 def feed(arrays: Tensor, noises: Sequence[ModelNoise], numbers: Sequence[Tensor]) -> dict[str, np.ndarray]:
-    """Return the inputs of an exported model by name."""
+    """Return the inputs of an exported model by name.
+
+    Args:
+        arrays: the user's arrays, (batch, *input_shape).
+        noises: descriptions of the random numbers that the model draws.
+        numbers: random numbers for each description, in the same order; those without a name are not fed.
+    """
     used = {noise.name: tensor.numpy() for noise, tensor in zip(noises, numbers, strict=True) if noise.name}
     return {"input": arrays.numpy(), **used}
 

@@ -73,6 +73,11 @@ class Frozen:
     differ by at most 1e-6 from those of the predictor. Raw parameters that ONNX Runtime computes differ by at most 1e-5
     times the largest one, or by 1e-5 if it is below 1; a network that differs more is run by torch.
 
+    Args:
+        predictor: the trained predictor; a copy of it is used.
+        input_shape: shape of one input; None if it is read from the first call, or from a `FrozenFrontEnd`.
+        data: data set that converts raw input; None if inputs are those of the predictor.
+
     Attributes:
         form: sentence that describes how the predictions are computed.
     """

@@ -45,6 +45,11 @@ class ServedModel:
     """Model that MLflow serves: it reads raw input and returns a table of predictions.
 
     The table has the numbers that `mode=predict` writes, and the modes of the densities.
+
+    Args:
+        predictor: the trained predictor, as `load_with_description` returns it.
+        description: its description.
+        data: data set that reads raw input for the model.
     """
 
     def __init__(self, predictor: Predictor, description: Description, data: Data) -> None:

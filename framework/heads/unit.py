@@ -61,6 +61,11 @@ class Unit(NamedTuple):
 class HeadOfReals(DensityHead):
     """Base class of heads that compute in the unit of standard deviations, with scales above a floor.
 
+    Args:
+        target: the predicted quantity, real numbers.
+        by: name of the head, for the message about a target of another kind.
+        floor: smallest scale, as below.
+
     Attributes:
         numbers: number of real numbers in the target.
         floor: smallest scale, in the unit of the raw parameters.

@@ -65,7 +65,15 @@ def _with_accent(command: re.Match[str]) -> str:
 
 @dataclass(frozen=True)
 class Description:
-    """Description of a plugin for `mode=plugins`, read from its source without importing it."""
+    """Description of a plugin for `mode=plugins`, read from its source without importing it.
+
+    Attributes:
+        group: Name of the registry.
+        name: Name of the plugin.
+        origin: Name and version of the plugin's package.
+        summary: First line of the docstring of the plugin's class.
+        bibtex: BibTeX entries that the class cites; "" for none.
+    """
 
     group: str
     name: str

@@ -52,7 +52,8 @@ def half_width(*points: Float[np.ndarray, "_ 2"]) -> float:
 def probabilities(predictor: Predictor, half_width: float) -> np.ndarray:
     """Return the number to draw at each grid point of the plane, (POINTS, POINTS); the first row is at the bottom.
 
-    For two classes it is p(y = 1); for K > 2 classes, the entropy divided by its largest value, log K.
+    For two classes the number is p(y = 1). For K > 2 classes it is the entropy divided by its largest value, log K. The
+    plane is a square with sides of 2 · `half_width`, centred at 0.
     """
     axis = torch.linspace(-half_width, half_width, POINTS)
     plane = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1).reshape(-1, 2)

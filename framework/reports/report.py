@@ -102,7 +102,14 @@ def save_metric_figures(run: Run, evaluation: Evaluation, title: str, *, synthet
 
 
 def record_results(run: Run, results: dict[str, Any], evaluation: Evaluation, run_cost: Cost) -> None:
-    """Write results.json, and log its numbers and the file to the store."""
+    """Write `results` as results.json, and log the file, the metrics and the cost to the store.
+
+    Args:
+        run: the run, whose folder and tracker receive the results.
+        results: content of results.json (`results_of`).
+        evaluation: values of the metrics.
+        run_cost: cost of a prediction.
+    """
     path = run.folder / "results.json"
     write_whole(path, json.dumps(results, indent=1).encode())
     numbers = {key: float(value) for key, value in asdict(run_cost).items() if isinstance(value, int | float)}
@@ -125,7 +132,17 @@ def results_of(
     columns: dict[str, str],
     better: Better,
 ) -> dict[str, Any]:
-    """Return the content of results.json."""
+    """Return the content of results.json.
+
+    Args:
+        run: the run, whose seed, experiment and folder are included.
+        method: name of the model in tables.
+        data: name of the data in tables.
+        evaluation: values of the metrics.
+        run_cost: cost of a prediction.
+        columns: headings of the table, by key.
+        better: directions of the columns.
+    """
     return {
         "method": method,
         "experiment": run.settings.experiment_name,

@@ -40,7 +40,7 @@ ACROSS = 3
 
 @dataclass(frozen=True)
 class Floor:
-    """Value below which an error is not meaningful, and the text that explains it in the legend."""
+    """Value `height` below which an error is not meaningful, and its explanation `meaning` for the legend."""
 
     height: float
     meaning: str

@@ -30,7 +30,14 @@ PATIENCE = 0.02
 
 @dataclass(frozen=True)
 class ForkJob:
-    """Job that a fork runs: arguments, environment variables, and descriptors of its output file and its lock."""
+    """Job that a fork runs.
+
+    Attributes:
+        arguments: Arguments of the job's command.
+        environment: Environment variables of the job.
+        console: Descriptor of the file that receives the job's output.
+        lock: Descriptor of a lock that is held until the last process of the job has ended.
+    """
 
     arguments: list[str]
     environment: dict[str, str]

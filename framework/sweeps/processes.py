@@ -63,7 +63,7 @@ class Process(Protocol):
 
 
 class LocalProcess:
-    """Values of the attributes of `Process` that are the same for every process on this machine."""
+    """Base class of processes on this machine, with those attributes of `Process` that have one value for all."""
 
     handle: str | None = None
     alive: bool = True

@@ -132,7 +132,14 @@ def run_task(job: NodeJob) -> None:
 
 
 class RayProcess:
-    """Task of Ray that runs a job; an implementation of the protocol `Process`."""
+    """Task of Ray that runs a job; an implementation of the protocol `Process`.
+
+    Args:
+        ray: Module `ray`.
+        reference: Reference to the result of the task.
+        handle: Name by which the engine knows the job.
+        folder: Folder of the job.
+    """
 
     pid = None
     alive = True

@@ -47,7 +47,7 @@ def compare(runs: Sequence[Mapping[str, Any]], overrides: Sequence[Sequence[str]
 
     Args:
         runs: Results, each with the "overrides" of its command.
-        overrides: Overrides of further jobs, whose results may be missing.
+        overrides: Overrides of further jobs, which may lack results; a setting that varies among them counts as varied.
     """
     if not runs:
         return None

@@ -64,7 +64,7 @@ class Copy(ABC):
 
     @abstractmethod
     def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:
-        """Record numbers."""
+        """Record numbers by name, with the optimiser step and the epoch."""
 
     @abstractmethod
     def drop_after(self, step: int) -> None:

@@ -29,7 +29,7 @@ LARGEST, LONGEST = 1 << 30, 1 << 24
 
 @dataclass(frozen=True)
 class Line:
-    """Metrics that one call of `Journal.write` recorded, with `time` in seconds since 1970."""
+    """Metrics that one call of `Journal.write` recorded: `values` by name, and `time` in seconds since 1970."""
 
     time: float
     step: int
@@ -51,6 +51,9 @@ class Journal:
 
     The first `write`, `append` or `drop_after` makes this process the only writer until `close`, and removes an
     incomplete last line that a crash has left. Reading changes nothing and is possible at any time, from any process.
+
+    Args:
+        path: Path of the file, which need not exist yet.
     """
 
     def __init__(self, path: Path) -> None:
@@ -68,7 +71,7 @@ class Journal:
         self._syncer: threading.Thread | None = None
 
     def write(self, values: Mapping[str, float], step: int, epoch: int) -> None:
-        """Append one line of metrics.
+        """Append one line of metrics: `values` by name, with the optimiser step and the epoch.
 
         Raises:
             DataError: The file cannot be opened, or another process writes it; only the first call raises this.

@@ -123,7 +123,12 @@ def read_run_info(folder: Path) -> RunInfo | None:
 
 
 class Sidecar:
-    """Record of a run (`RunInfo`), kept in memory and in the file `run.json` with the same content."""
+    """Record of a run (`RunInfo`), kept in memory and in the file `run.json` with the same content.
+
+    Args:
+        folder: Folder of the run, which contains the file.
+        info: The record.
+    """
 
     def __init__(self, folder: Path, info: RunInfo) -> None:
         self.info = info

@@ -81,6 +81,12 @@ def send_new(journal: Journal, sidecar: Sidecar, store: Store, stop: Callable[[]
 
     Lines that are written to the journal during this call are left for the next call. Otherwise each line of a training
     would be sent in a call of its own.
+
+    Args:
+        journal: Journal of the run.
+        sidecar: Record of the run, which says how much of the journal was sent, and is updated.
+        store: Run in the store.
+        stop: Function that returns whether to stop before the next batch.
     """
     count, last_line = 0, journal.last
     while sidecar.info.sent < last_line and (records := journal.read(sidecar.info.sent)):
@@ -127,6 +133,12 @@ def send_owed(
 def send_all(folder: Path, journal: Journal, sidecar: Sidecar, open_store: OpenStore) -> int:
     """Send everything of a run whose process has ended, and return the number of journal lines sent.
 
+    Args:
+        folder: Folder of the run.
+        journal: Journal of the run.
+        sidecar: Record of the run, which says what was sent.
+        open_store: Function that opens the run in its store.
+
     Raises:
         UserError: The store did not accept everything.
     """
@@ -144,7 +156,14 @@ def send_all(folder: Path, journal: Journal, sidecar: Sidecar, open_store: OpenS
 
 
 class Sender(threading.Thread):
-    """Thread that sends a growing journal until `finish` is called, and tries again after failures of the store."""
+    """Thread that sends a growing journal until `finish` is called, and tries again after failures of the store.
+
+    Args:
+        folder: Folder of the run.
+        journal: Journal to send.
+        sidecar: Record of the run, which says how much of the journal was sent.
+        open_store: Function that opens the run in its store.
+    """
 
     def __init__(self, folder: Path, journal: Journal, sidecar: Sidecar, open_store: OpenStore) -> None:
         super().__init__(name="tracking", daemon=True)  # a store that hangs does not keep the process alive

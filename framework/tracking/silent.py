@@ -10,7 +10,11 @@ from framework.tracking.tracker import JOURNAL, Status, Tracker
 
 @final
 class SilentTracker(Tracker):
-    """Tracker that records nothing, because the first of several ranks that train together records the run."""
+    """Tracker that records nothing, because the first of several ranks that train together records the run.
+
+    Args:
+        folder: Folder of the run, whose journal can be read.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.journal = Journal(folder / JOURNAL)  # read, never written

@@ -61,7 +61,7 @@ class Tracker(ABC):
 
     @abstractmethod
     def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:
-        """Record numbers, which may be NaN or infinite."""
+        """Record numbers by name, which may be NaN or infinite, with the optimiser step and the epoch."""
 
     @abstractmethod
     def log_dataset(self, name: str, context: str, facts: Mapping[str, str]) -> None:

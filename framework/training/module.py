@@ -49,6 +49,10 @@ class LoadedBatches(pl.LightningDataModule):
     """Lightning's view of `Batches`, to which it attaches the trainer.
 
     The trainer needs `use_distributed_sampler=False`, because `Batches` divides the samples among ranks.
+
+    Args:
+        batches: loaders of the batches.
+        trainer: the trainer, which says at which batch to start, the rank and the device.
     """
 
     def __init__(self, batches: Batches, trainer: pl.Trainer) -> None:
@@ -72,6 +76,12 @@ class Training(pl.LightningModule):
     error before the optimiser step.
 
     Args:
+        predictor: predictor that is trained.
+        objectives: terms that are added to the loss.
+        data: data set, whose `augment` varies the batches.
+        optimizer: settings of the optimiser and of its schedule.
+        seed: seed of the noise.
+        description: description of the model, which is added to checkpoints (`configuration.description`).
         cached: True if batches hold cached features (training.cached_features) instead of inputs; the predictor is then
             a `FrozenFrontEnd`.
     """
@@ -358,6 +368,11 @@ class KeepCheckpoints(BatchCallback):
     best.ckpt is saved whenever the validation loss reaches a new minimum. Every write is atomic
     (framework.storage.checkpoints).
 
+    Args:
+        folder: folder of the checkpoints.
+        every_steps: number of steps between two saves of last.ckpt within an epoch; None: there are no such saves.
+        keep: which weights are tested: those with the lowest validation loss ("best") or those of the last epoch.
+
     Attributes:
         kept_loss: validation loss of the weights that will be tested, nats.
         kept_epoch: epoch of these weights, from 0.
@@ -464,6 +479,10 @@ class LogMetrics(BatchCallback):
     """Callback that logs training loss and learning rate every `every_steps` steps, and the loss of every validation.
 
     The last step of an epoch is logged too.
+
+    Args:
+        tracker: tracker that receives the numbers.
+        every_steps: number of steps between two entries.
     """
 
     def __init__(self, tracker: Tracker, every_steps: int) -> None:
@@ -500,6 +519,10 @@ class StopAtBatch(BatchCallback):
     """Callback that handles a signal at the end of the current training batch: it saves last.ckpt and stops the run.
 
     A signal during the last batch of an epoch is handled at the end of the epoch.
+
+    Args:
+        stopper: handler of the signals.
+        keep: callback that saves last.ckpt.
     """
 
     def __init__(self, stopper: Stopper, keep: KeepCheckpoints) -> None:

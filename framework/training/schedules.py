@@ -63,6 +63,8 @@ def step_factor(step: int, *, starts: list[int], factor: float, warmup_steps: in
 class Plateau:
     """Schedule that multiplies the rate by `factor` after `patience` epochs without a lower validation loss.
 
+    The rate also rises linearly during the first `warmup_steps` steps (`warmup_factor`).
+
     Torch's ReduceLROnPlateau is not used: Lightning passes the loss to it after writing an epoch's checkpoint, so a
     resumed run would miss this loss. The state of this class is stored in checkpoints, because LambdaLR stores the
     attributes of the functions that it calls.
