@@ -29,9 +29,12 @@ FOLDER = ROOT / "outputs/thesis_tables"
 COMMON_OVERRIDES = ("pictures=false", "logger=none")
 FIGURES = "| 3.7-3.8 |"
 AT_ONCE = 2
-"""Number of runs that work at the same time, for the minutes on the page."""
+"""Number of runs at the same time for which the page states the minutes.
+
+The processor time of all runs is divided by this number.
+"""
 RUNS, MINUTES, PAGES = 3, 4, 5
-"""Numbers of the columns of the page that the script reads again."""
+"""Indices of the columns for runs, minutes and page times in the page's table, which the script reads again."""
 BFLOAT16 = "trainer.precision=bf16-mixed"
 """Override of `--bfloat16`, for convolutional networks; it saves time on processors with avx512_bf16."""
 CLASSES = (

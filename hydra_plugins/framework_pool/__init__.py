@@ -41,13 +41,13 @@ _COMPOSING = "framework.configuration.composition"
 
 
 class EngineLauncher(Launcher):
-    """Hydra launcher whose jobs an engine starts; everything but the engine is the same code for all launchers.
+    """Base class of Hydra launchers; a subclass gives the engine (`framework.sweeps.engines`) that starts the jobs.
 
     Args:
         jobs: number of jobs that run at once; None: all.
         retries: number of times that a killed job is started again; it resumes from its checkpoint.
         devices: CUDA devices to assign, one to each running job; None: every job sees all devices.
-        eager: whether the command returns when all jobs have been started.
+        eager: whether the command returns as soon as all jobs are started, without waiting for their ends.
     """
 
     def __init__(
@@ -139,13 +139,13 @@ class EngineLauncher(Launcher):
 
     @contextmanager
     def batches(self, watch: Callable[[sweep.Job], None] | None = None) -> Iterator[None]:
-        """Let a search call `launch` several times inside the block.
+        """Return a context in which a search may call `launch` once for each batch of jobs.
 
-        All batches share an engine, and the table of all jobs is printed at the end of the block. The mistakes in the
-        configs of a batch are not looked for, because the search has called `check` for its whole space.
+        All batches share one engine, and the table of all jobs is printed when the context ends. In the context,
+        `launch` does not check the configs of the jobs, because the search has called `check` for its whole space.
 
         Args:
-            watch: Function that is called again and again for each running job.
+            watch: Function that is called repeatedly for each running job; None for no function.
         """
         self._watch = watch
         try:
@@ -157,7 +157,14 @@ class EngineLauncher(Launcher):
     def check(
         self, job_overrides: Sequence[Sequence[str]], first: int = 0
     ) -> tuple[list[DictConfig], list[dict[str, Any]]]:
-        """Return the config of each job, composed and as plain values.
+        """Check the settings of the launcher and the configs of all jobs, before any job starts.
+
+        Args:
+            job_overrides: Overrides of each job.
+            first: Number of the first job; the other jobs have the numbers that follow.
+
+        Returns:
+            The composed config of each job, and the same configs as plain dictionaries.
 
         Raises:
             ConfigError: The engine is not installed, a setting of the launcher is wrong, or the config of a job has a
@@ -301,7 +308,8 @@ class SlurmLauncher(EngineLauncher):
     Args:
         jobs: number of jobs that are submitted at once; None: all.
         retries: number of times that a killed job is submitted again; it resumes from its checkpoint.
-        eager: whether the command returns when all jobs have been submitted; repeat it for the table.
+        eager: whether the command returns as soon as all jobs are submitted. The same command, given again later,
+            waits for the jobs and prints the table of their results.
         settings: resources of each job; see `SlurmSettings`.
     """
 

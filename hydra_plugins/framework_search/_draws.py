@@ -33,7 +33,14 @@ def quantile(seed: int, trial: int, key: str) -> float:
 
 
 def describe(space: Mapping[str, Domain], count: int, trials: int, repeated: int) -> str:
-    """Return a line that describes the search."""
+    """Return a line for the log that describes a random search.
+
+    Args:
+        space: Search space.
+        count: Number of trials that are run.
+        trials: Number of trials that were requested.
+        repeated: Number of draws that repeated an earlier trial.
+    """
     keys = [key.lstrip("+") for key, domain in space.items() if domain.size > 1]
     line = f"random search over {', '.join(keys) or 'a single point'}: {count} trials"
     if count < trials:

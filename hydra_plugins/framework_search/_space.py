@@ -95,10 +95,11 @@ def overrides_of(values: Mapping[str, str]) -> list[str]:
 
 
 def extremes(space: Mapping[str, Domain]) -> list[list[str]]:
-    """Return the overrides of a few points whose configs show whether the values of each key are valid.
+    """Return the overrides of a few points of the search space, whose configs show whether all values are valid.
 
-    The first point has the first value of each key; any other point has another value of one key, which is each value
-    of a list and the last value of an interval or a range of numbers.
+    At the first point every key has its first value. Every further point differs from the first point in one key. For a
+    list of values there is one further point for each other value; for an interval or a range of numbers there is one,
+    with the last value.
     """
     first = {key: domain.at(0.0) for key, domain in space.items()}
     points = [first]

@@ -1,4 +1,4 @@
-"""Study of Optuna: where it is stored, the trials that it suggests, and the values and losses that it is told."""
+"""Optuna's study of a search: its storage, the trials that it suggests, and the values and losses of the trials."""
 
 import json
 import logging
@@ -38,12 +38,16 @@ from hydra_plugins.framework_search._space import Choice, Domain, overrides_of
 
 FILE, LOCK = "study.jsonl", ".study.lock"
 REPEATS = 100
-"""Number of suggestions in a row that repeat earlier trials after which a search ends, because it has converged."""
+"""Number of consecutive suggestions that only repeat earlier trials, after which a search counts as converged."""
 INTERVAL = 0.5
-"""Seconds between two looks at the validation losses of a running trial."""
+"""Smallest time, seconds, between two readings of the validation losses of a running trial."""
 COMMAND, WAYS, FOLDER = "command", "ways", "folder"
-"""Attributes of a study: the search space and the fixed overrides, and the directions of its metrics; and of a trial:
-the hash of the path of the sweep's folder."""
+"""Names of attributes that Optuna stores.
+
+COMMAND, an attribute of the study, holds the search space, the fixed overrides and the names of the metrics. WAYS, also
+of the study, holds the directions of the metrics. FOLDER, an attribute of each trial in a database, holds a hash of the
+path of the sweep's folder.
+"""
 
 log = logging.getLogger(__name__)
 
@@ -163,21 +167,24 @@ class Study:
 
     @property
     def ways(self) -> list[str | None]:
-        """Return the direction of each metric, "minimize" or "maximize"; None where no trial has shown it."""
+        """Return the direction of each metric, "minimize" or "maximize"; None for each metric before `store_ways`."""
         with self._reached():
             stored = self._study.user_attrs.get(WAYS)
         return stored or [None] * len(self._study.directions)
 
     def store_ways(self, ways: Sequence[str]) -> None:
-        """Store the directions of the metrics, whose values are stored with the sign that makes lower values better."""
+        """Store the direction of each metric, "minimize" or "maximize".
+
+        The values that `tell` stores do not depend on the directions: their sign is such that lower values are better.
+        """
         with self._reached():
             self._study.set_user_attr(WAYS, list(ways))
 
     def take_up(self, is_running: Callable[[Sequence[str]], bool]) -> None:
-        """Let the study suggest again the trials of this folder that failed, or whose command was killed.
+        """Let `suggest` return again the trials of this sweep's folder that failed, or whose command was killed.
 
         Args:
-            is_running: Function that tells whether the job of some overrides runs now.
+            is_running: Function that returns whether the job with the given overrides runs now.
         """
         with self._reached(), hold_lock(self.folder / LOCK):
             for trial in self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
@@ -188,9 +195,12 @@ class Study:
                     self._enqueue(point.params)
 
     def take_over(self) -> bool:
-        """Let the study suggest again the trials that other commands run in this folder; return whether there are any.
+        """Let `suggest` return again the trials that other commands run in this sweep's folder.
 
-        The launcher does not start such a job a second time, but waits for it.
+        The launcher does not start the job of such a trial a second time, but waits for its end.
+
+        Returns:
+            Whether there are such trials.
         """
         with self._reached(), hold_lock(self.folder / LOCK):
             trials = self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
@@ -223,11 +233,11 @@ class Study:
     def suggest(self, count: int, trials: int) -> list[list[str]]:
         """Return the overrides of the next trials, none of which repeats another trial of the study.
 
-        A suggestion that repeats a trial is told the values of that trial.
+        If the sampler suggests an earlier trial again, Optuna gets the values of the earlier trial for the repetition.
 
         Args:
             count: Largest number of trials to return.
-            trials: Number of points that the study shall have at last.
+            trials: Number of different points after which the search ends.
 
         Returns:
             At most `count` trials; fewer if the study then has `trials` points, if it has every point of its space, or

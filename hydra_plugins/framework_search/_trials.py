@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hydra_plugins.framework_search._study import Point, Study
 
 PRUNED = "pruned"
-"""Note of a trial that was pruned."""
+"""Note that the table of trials shows for a pruned trial."""
 
 
 def trial_of(result: JobReturn) -> Trial:
@@ -52,7 +52,7 @@ def trials_of(study: "Study", returned: Sequence[JobReturn]) -> list[Trial]:
 
 
 def running_in(folder: Path) -> Callable[[Sequence[str]], bool]:
-    """Return a function that tells whether the job of some overrides runs now in the folder of a sweep."""
+    """Return a function of overrides that returns whether the job with these overrides runs now in a sweep's folder."""
     records = find_records(folder.absolute())
 
     def is_running(overrides: Sequence[str]) -> bool:

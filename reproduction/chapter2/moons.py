@@ -74,10 +74,12 @@ BETTER: Better = {
     "entropy_sure": "lower",
 }
 SURE, UNSURE = 0.99, 0.7
-"""Bounds on the largest class probability of the generator's posterior: above the first one class is nearly certain,
-below the second both classes are likely."""
+"""Bounds on the largest class probability of the generator's posterior.
+
+Above SURE one class is nearly certain; below UNSURE both classes are likely.
+"""
 BAND = (0.1, 0.9)
-"""Predicted probabilities of class 1 that count as unsure."""
+"""Smallest and largest probability of class 1 for which a prediction counts as unsure."""
 LANDSCAPE_COLUMNS = {
     "method": "method",
     "entropy_sure": "entropy where the posterior is sure, nats",
@@ -127,7 +129,10 @@ def read_results(sweeps: list[Path]) -> list[dict[str, Any]]:
 
 
 def measure_times(rows: list[dict[str, Any]]) -> None:
-    """Measure the prediction time of each row again, alone; in the sweep other jobs ran at the same time."""
+    """Measure the prediction time of each model again, because in the sweep other jobs ran at the same time.
+
+    The times replace those in `rows`.
+    """
     data = build("data", resolve("data", "moons"))
     data.prepare()
     batch = next(iter(Batches(data, batch_size=100, workers=0, seed=0).test_dataloader()))
@@ -144,7 +149,11 @@ def test_points(seed: int) -> dict[str, torch.Tensor]:
 
 @torch.inference_mode()
 def add_landscape(rows: list[dict[str, Any]]) -> None:
-    """Add to each row the entropies and the share of unsure test points that describe Figure 2.3."""
+    """Add numbers that describe the landscapes of Figure 2.3 to each row.
+
+    They are the mean entropies, nats, at the test points where the posterior is sure and where it is unsure, and the
+    share of test points with an unsure prediction (`BAND`).
+    """
     points = {seed: test_points(seed) for seed in {row["seed"] for row in rows}}
     for row in rows:
         fields = points[row["seed"]]
@@ -158,7 +167,7 @@ def add_landscape(rows: list[dict[str, Any]]) -> None:
 
 
 def posterior_landscape(seeds: list[int]) -> str:
-    """Return a sentence with the same numbers for the posterior of the generator."""
+    """Return a sentence with the numbers of `add_landscape` for the generator's exact posterior."""
     statistics = []
     for seed in seeds:
         p = test_points(seed)["posterior"].double()
@@ -232,8 +241,10 @@ CLAIMS = (
 
 
 def claims_table(rows: list[dict[str, Any]]) -> str:
-    """Return a table of the differences in `CLAIMS`: mean, standard deviation, and seeds in which the first is
-    better."""
+    """Return a table with the difference of two methods for each claim in `CLAIMS`.
+
+    It shows mean and standard deviation of the difference over seeds, and the number of seeds that support the claim.
+    """
     lines = ["| claim | difference of two methods, same seed | seeds in favour |", "|---|---|---|"]
     for first, second, key, claim in CLAIMS:
         first_scores, second_scores = (

@@ -26,7 +26,7 @@ HERE = Path(__file__).resolve()
 FOLDER = ROOT / "outputs/sweeps/targets"
 ROWS, SEEDS, BINS = 3000, 5, 12
 SEAM = 10.0
-"""Half width in degrees of the region around ±180° that is evaluated apart."""
+"""Half width, degrees, of the region around ±180° for which the error is also reported separately."""
 COMMON = (
     *("data=tabular", f"data.path={FOLDER / 'table.csv'}", "encoder=[mlp]", "encoder.mlp.widths=[64,64]"),
     *("metric=[log_likelihood]", "trainer.max_epochs=30", "pictures=false", "logger=none", "threads=1"),

@@ -39,7 +39,7 @@ SAMPLES = 1000
 TURNED = math.radians(135)
 """Error in radians above which the back of an object is taken for its front."""
 SURE, NEAR = 0.9, math.radians(45)
-"""A density is sure if it puts the probability SURE within the angle NEAR (radians) of its median."""
+"""Limits for a density that counts as sure: a probability above SURE within NEAR radians of its median."""
 
 
 class ImageScores(NamedTuple):
@@ -63,8 +63,10 @@ def correlation(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def errors_of_thirds(scores: ImageScores) -> tuple[float, float]:
-    """Return the mean errors of the thirds with the lowest and the highest entropy, or NaN if all entropies are
-    equal."""
+    """Return the mean errors of two thirds of the images: those with the lowest and those with the highest entropy.
+
+    Both are NaN if all entropies are equal.
+    """
     if np.ptp(scores.entropy) < 1e-6:
         return math.nan, math.nan
     order = np.argsort(scores.entropy, kind="stable")
@@ -126,8 +128,10 @@ def _score_batch(density: Distribution, azimuth: Tensor) -> tuple[Tensor, ...]:
 
 
 def score_run(run: Path, loaders: dict[str, Batches]) -> ImageScores | None:
-    """Score a trained model on the test images of its class; return None if the class looks alike from several
-    sides."""
+    """Return the results of a trained model on the test images of its class.
+
+    The result is None if the objects of the class look the same from several sides.
+    """
     model, description = load_with_description(run)
     category = str(description.config["data"]["category"])
     if category not in loaders:

@@ -48,8 +48,10 @@ THESIS = {
 
 
 def class_mean_section(rows: list[dict[str, Any]]) -> str:
-    """Return a table of the methods that were trained on every class: means over classes, and differences from fixed
-    κ."""
+    """Return a table of the methods that were trained on every class.
+
+    It shows the means over classes, and the differences from the method with fixed κ.
+    """
     classes = sorted({row["data"] for row in rows})
     values_by_method: dict[str, np.ndarray] = {}
     for method in METHODS:

@@ -48,7 +48,10 @@ FINE_TUNING = (
     "trainer.check_val_every_n_epoch=10",
 )
 EPOCHS = {"tvae": 600, "lstm": 150, "hybrid": 150}
-"""Epochs of three steps on recorded flights; the validation loss of the TVAE falls for longer."""
+"""Number of epochs of the training on recorded flights; an epoch has three steps.
+
+The TVAE has more epochs, because its validation loss falls for longer.
+"""
 MOST_WINDOWS = 1000
 """Largest number of windows of a split that are evaluated."""
 BUNDLES = (0, 3, 5)
@@ -59,8 +62,15 @@ Model = Any
 
 
 class FlightErrors(NamedTuple):
-    """Results of a method: mean error at each frame (cm), results of `FlightError`, and coverage of the 90 % intervals
-    before and after calibration."""
+    """Results of a method on the test split.
+
+    Attributes:
+        growth: mean error at each predicted frame, cm.
+        numbers: results of `FlightError`.
+        before: coverage of the 90 % intervals before calibration.
+        after: coverage of the 90 % intervals after calibration.
+        metric: the metric, which holds the flights for the figures.
+    """
 
     growth: np.ndarray
     numbers: dict[str, float]
@@ -97,7 +107,7 @@ def select_windows(data: Data, name: str) -> dict[str, torch.Tensor]:
 
 @torch.no_grad()
 def draw_ranks(model: Model, batch: dict[str, torch.Tensor]) -> tuple[Prediction, torch.Tensor]:
-    """Return the prediction, and the share of samples below each recorded coordinate, shape (window, coordinate)."""
+    """Return the prediction, and the share of its samples below each recorded coordinate, (window, coordinate)."""
     density = model(batch["input"])
     prediction = Prediction(density, batch, samples=200)
     draws = density.sample((DRAWS,))
@@ -125,8 +135,11 @@ def evaluate_flights(model: Model, data: Data) -> FlightErrors:
 
 
 def measure_latency(folder: Path, data: Data) -> str:
-    """Return table cells: median ms of one prediction with 30 samples, frozen and in torch, and their largest
-    difference."""
+    """Return three cells of a table about one prediction with 30 samples.
+
+    The cells are the median time, ms, of the frozen model (`framework.freeze`); the median time, ms, of the original
+    model; and the largest relative difference of the medians that both predict.
+    """
     model, frozen = framework.load(folder), framework.freeze(folder)
     inputs = select_windows(data, "test")["input"]
     extreme = torch.cat(
@@ -159,9 +172,10 @@ def prepare_data(root: str | None, seed: int = 0) -> Data:
 
 
 def nearest_window_errors(data: Data) -> np.ndarray:
-    """Return the mean error in cm at each frame of the mean future of the five nearest training windows.
+    """Return the errors of a simple baseline that needs no training: the mean error at each predicted frame, cm.
 
-    Windows are compared by the last position of the ball and by the eight last positions relative to it.
+    The baseline finds the five training windows that are nearest to a test window, and predicts the mean of their
+    futures. Windows are compared by the last position of the ball and by the eight last positions relative to it.
     """
 
     def window_features(fields: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
@@ -393,7 +407,10 @@ def write_results(
 
 
 def error_ratios(results: dict[str, list[FlightErrors]], method: str) -> str:
-    """Return the ratios between the errors of a method and of physics at some times, and the largest ratio, as text."""
+    """Return a text with the error of a method divided by the error of physics, at several predicted frames.
+
+    The text ends with the largest ratio over all frames.
+    """
     ratio = results[method][0].growth / results["ballistic"][0].growth
     frames = sorted({1, 2, 3, 4, *TABLE_FRAMES})
     text = ", ".join(f"{ratio[frame - 1]:.2f} at {16 * frame} ms" for frame in frames)

@@ -80,7 +80,13 @@ def growth_power(larger: Tensor, smaller: Tensor) -> tuple[float, float]:
 
 
 def measure_movement(clouds: Tensor) -> list[dict[str, object]]:
-    """Measure how much features change with a shift or a rotation, relative to their distance between two shapes."""
+    """Measure how much the features of each encoding change when clouds are shifted or rotated.
+
+    Changes are divided by the mean distance between the features of two different shapes.
+
+    Returns:
+        One row for each encoding and kind of movement, by column name.
+    """
     rows: list[dict[str, object]] = []
     for name, encoding in ENCODINGS.items():
         before = encoding(clouds)
@@ -125,7 +131,14 @@ def move_points(clouds: Tensor, share: float, far: float) -> Tensor:
 
 
 def measure_recognition(clouds: Tensor) -> list[dict[str, object]]:
-    """Measure the share of disturbed clouds whose features are nearest to those of the same cloud undisturbed."""
+    """Measure how often a cloud is recognised after some of its points were moved.
+
+    A disturbed cloud counts as recognised if its features are nearer to those of its undisturbed cloud than to those of
+    any other undisturbed cloud.
+
+    Returns:
+        One row for each normalisation, with the share of recognised clouds for each disturbance in `STRAY`.
+    """
     rows: list[dict[str, object]] = []
     order = torch.randperm(clouds.shape[1], generator=torch.Generator().manual_seed(3))
     clouds = clouds[:, order]  # points of a generated surface are ordered by faces

@@ -111,13 +111,22 @@ def curve(rows: list[dict[str, object]], method: str) -> np.ndarray:
 
 
 def error_ratio(rows: list[dict[str, object]], method: str, other: str, length: int) -> float:
-    """Return the ratio of the errors of two methods at a length, interpolated on logarithmic scales."""
+    """Return the error of `method` divided by the error of `other`, for encodings of `length` numbers.
+
+    Errors between measured lengths are interpolated on logarithmic scales.
+    """
     values = [np.interp(math.log(length), *np.log(curve(rows, name))) for name in (method, other)]
     return math.exp(values[0] - values[1])
 
 
 def least_time(call: Callable[[], object], least: int = 5, seconds: float = 0.5) -> float:
-    """Return the least processor time of a call in ms."""
+    """Return the smallest processor time of several calls of a function, in ms.
+
+    Args:
+        call: the function.
+        least: smallest number of timed calls.
+        seconds: processor time after which no further call begins.
+    """
     call()
     times, begun = [], process_time()
     while len(times) < least or (process_time() - begun < seconds and len(times) < 200):
@@ -128,7 +137,10 @@ def least_time(call: Callable[[], object], least: int = 5, seconds: float = 0.5)
 
 
 def search_ball_tree(cloud: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Search nearest points as §6.5.4 describes it, including the construction of the tree."""
+    """Return the distance of each of `points` to its nearest point of the cloud, by the ball tree of thesis §6.5.4.
+
+    The tree is built in each call, so that the measured time includes its construction.
+    """
     return (
         NearestNeighbors(n_neighbors=1, leaf_size=1, algorithm="ball_tree").fit(cloud).kneighbors(points)[0]
     )

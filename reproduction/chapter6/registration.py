@@ -51,8 +51,10 @@ def processor_ms(call: Callable[[], object], repeats: int = 100) -> float:
 
 
 def projection_errors(data) -> dict[int, float]:
-    """Return, for each rank, the mean vertex error in cm of test bodies after projection onto as many principal
-    components of training bodies."""
+    """Return the mean vertex error, cm, of test bodies that are projected onto principal components.
+
+    The components are those of training bodies. The keys of the result are the numbers of components in `RANKS`.
+    """
     # the target of a sample is the mesh in the frame of its scan, which is what a model predicts
     parts = {}
     for name, split, count in (

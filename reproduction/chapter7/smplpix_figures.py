@@ -41,7 +41,7 @@ VIEWS = tuple(math.radians(degrees) for degrees in (0, 60, 120, 180, 240, 300))
 FRONT = math.radians(25)
 POSES = 5
 SHAPES = ("0=-2", "0=2", "1=-2", "1=2", "2=-2", "2=2")
-"""Changes of shape as in plugins.data.human_scans.repose: number of the direction and standard deviations."""
+"""Changes of shape: "0=-2" changes shape coefficient 0 by -2 standard deviations (plugins.data.human_scans.repose)."""
 ERROR_FACTOR = 3
 """Factor by which errors are enlarged in the figures."""
 

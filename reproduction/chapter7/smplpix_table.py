@@ -65,8 +65,10 @@ UNNAMED_OVERRIDES = (
     *("experiment", "data.topology", "seed", "trainer.max_epochs"),
     *("metric", "pictures", "logger", "threads", "workers"),
 )
-"""Overrides that do not distinguish rows by name: a column shows them, all runs have them, or no image depends on
-them."""
+"""Overrides that the name of a row leaves out.
+
+They are shown in a column of their own, are the same in all runs, or have no influence on the images.
+"""
 BASELINE = "rasterised"
 COLUMNS = {
     "psnr_db": ("PSNR, dB", 2),

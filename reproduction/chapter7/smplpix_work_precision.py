@@ -74,8 +74,10 @@ def meshes(description: Description) -> Iterator[tuple[str, int, Predictor, Data
 
 
 def networks(run: str) -> Iterator[tuple[str, Predictor, Data]]:
-    """Yield name, predictor and data of a run in float32 and bfloat16, for the box of the subject and the whole
-    frame."""
+    """Yield name, predictor and data for four settings of a run's network.
+
+    The settings are float32 and bfloat16, each for the subject's box alone and for the whole image.
+    """
     description, state = read_stored(run)
     data = prepare_data(description, description.config["data"]["topology"])
     name = f"{description.method} {description.config['data']['topology']}"

@@ -17,7 +17,10 @@ SHOWN = {
 }
 """Names of the predicted numbers in the figure, and their headings; the figure also shows the asymmetry."""
 Maps = Mapping[str, tuple[Float[np.ndarray, "row column"], Float[np.ndarray, "row column"] | None]]
-"""Name of a number → its map and the map of its standard deviation, NaN outside the brain."""
+"""Maps of a slice by the name of the mapped number, NaN outside the brain.
+
+Each entry is the map of the number and the map of its standard deviation, or None if the number has none.
+"""
 SIZE = 2.1
 """Side of a map, inches."""
 

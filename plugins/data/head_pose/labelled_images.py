@@ -51,7 +51,7 @@ class Reading:
     skip_unreadable: bool = False
 
     def crop(self, file: Path, split: str) -> Crop:
-        """Return the settings that read a whole image, without a box. They blur an image of the test split."""
+        """Return the settings that read the whole image `file`, blurred by `test_blur` if `split` is "test"."""
         return Crop(file, None, 0.0, self.image_size, blur=self.test_blur if split == "test" else 0.0)
 
     def read_unlabelled(self, files: Sequence[Path]) -> Fields | Crops:

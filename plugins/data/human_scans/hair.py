@@ -13,7 +13,7 @@ Style = Literal["none", "short", "full", "round", "long", "tail", "bun"]
 STYLES: tuple[Style, ...] = ("none", "short", "full", "round", "long", "tail", "bun")
 SHARES = (0.06, 0.26, 0.16, 0.1, 0.2, 0.12, 0.1)
 LINE = ((-1, -0.35, -0.2, 0.1, 0.35, 0.7, 1), (0.16, 0.2, 0.52, 0.62, 0.7, 0.8, 0.83))
-"""Hairline at the side of a head: z and y of `Anatomy.on_head`."""
+"""Points of the hairline at the side of a head: their coordinates z and y, as in `Anatomy.on_head`."""
 HEAD = 0.23
 """Height of a head, metres, which converts distances from the hairline."""
 

@@ -60,24 +60,48 @@ Pixels = UInt8[Tensor, "channels height width"]
 
 
 def add_noise(image: Pixels, deviation: float, index: int) -> Pixels:
-    """Add Gaussian noise of a standard deviation in units of the full range; `index` is the seed."""
+    """Return the image with Gaussian noise.
+
+    Args:
+        image: The image.
+        deviation: Standard deviation of the noise, as a share of the range from 0 to 255.
+        index: Number of the sample, which is the seed of the noise.
+    """
     noise = np.random.default_rng(index).normal(0.0, 255 * deviation, tuple(image.shape))
     return _round(image + torch.from_numpy(noise))
 
 
 def blur(image: Pixels, share: float, index: int) -> Pixels:
-    """Convolve with a Gaussian whose standard deviation is a share of the image's side."""
+    """Return the image convolved with a Gaussian.
+
+    Args:
+        image: The image.
+        share: Standard deviation of the Gaussian, as a share of the image's side.
+        index: Number of the sample, which is not used.
+    """
     return images.blur(image, share * image.shape[-1])
 
 
 def reduce_contrast(image: Pixels, factor: float, index: int) -> Pixels:
-    """Multiply the difference of each pixel from the mean of its channel by a factor."""
+    """Return the image with the differences of all pixels from the mean of their channel multiplied by a factor.
+
+    Args:
+        image: The image.
+        factor: The factor.
+        index: Number of the sample, which is not used.
+    """
     mean = image.double().mean((1, 2), keepdim=True)
     return _round(mean + factor * (image - mean))
 
 
 def compress(image: Pixels, quality: float, index: int) -> Pixels:
-    """Write the image as a JPEG file of a quality, and read it again."""
+    """Return the image after it is written as a JPEG file and read again.
+
+    Args:
+        image: The image.
+        quality: Quality of the JPEG format; lower values give stronger artefacts.
+        index: Number of the sample, which is not used.
+    """
     pixels = image.permute(1, 2, 0).numpy()
     stream = BytesIO()
     Image.fromarray(pixels[..., 0] if len(image) == 1 else pixels).save(stream, "JPEG", quality=int(quality))

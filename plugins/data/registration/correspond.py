@@ -114,8 +114,8 @@ def write_correspondences(
     """Compute the correspondences of every pair through registered meshes, and write them to `<out>/<challenge>.zip`.
 
     For a vertex of the first scan, the nearest vertex of the mesh that is registered to the first scan is found. The
-    vertex with the same number in the mesh that is registered to the second scan gives the position there (thesis
-    §6.5.2). `registered` is called once for each scan.
+    vertex with the same number in the mesh that is registered to the second scan gives the position on the second scan
+    (thesis §6.5.2). `registered` is called once for each scan.
 
     Raises:
         DataError: the challenge has no pairs, or a scan cannot be read.

@@ -26,7 +26,7 @@ VERSION = 1
 DISTANCE = 4.0
 """Distance of the camera from the centre of the solid, in radii of the ball around the solid."""
 FIELD_OF_VIEW = 2 * math.asin(1.05 / DISTANCE)
-"""Field of view, radians: the ball of radius 1 and a margin."""
+"""Field of view, radians, in which the ball around the solid appears with a margin of 5 % of its radius."""
 LAMP = (0.4, 0.6, 0.69)
 """Direction to the lamp in the frame of the camera (x right, y up, z to the viewer)."""
 BATCH = 100

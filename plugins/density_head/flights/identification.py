@@ -73,7 +73,7 @@ def identify(
     2000, §6.1).
 
     Args:
-        observations: whole flights, from before the window to after it.
+        observations: frames of whole flights: the frames that a model reads, and those that it predicts.
         initial: constants from which the search starts.
         states: states at the first frames, from which the search starts.
         noise: standard deviation of each coordinate, m.

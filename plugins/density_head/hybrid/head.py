@@ -31,7 +31,7 @@ class HybridHead(DensityHead):
     Args:
         further: number of features of the encoder beside the mean and the units.
         hidden: width of the network.
-        share: unit of the component, as a share of the encoder's units.
+        share: factor by which the encoder's units are multiplied to give the units of the component.
         component: the head whose density is shifted and scaled.
     """
 

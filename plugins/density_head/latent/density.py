@@ -112,7 +112,12 @@ class Latent(ABC):
         return torch.autocast(self.center.device.type, enabled=False)
 
     def points(self, effort: Effort, kept_count: int = 0) -> NormalPoints:
-        """Return the sequences of standard normal points for all items (`NormalPoints`)."""
+        """Return the sequences of standard normal points for all items (`NormalPoints`).
+
+        Args:
+            effort: number of samples, which determines the number of replicates.
+            kept_count: number of points of each replicate that stay in memory, as in `NormalPoints`.
+        """
         dtype, device = self.center.dtype, self.center.device
         dimensions = self.center.shape[-1]
         return NormalPoints(

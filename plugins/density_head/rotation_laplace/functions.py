@@ -44,8 +44,12 @@ def squared_distance(
 ) -> Float[Tensor, "..."]:
     """Return d² = tr(S - AᵀR) + δ² for unit quaternions of R and parameters A, float64; batch shapes broadcast.
 
-    The trace is computed as Σ λᵢqᵢ², so that no digits cancel. It is differentiable once; the derivative in `turn` is
-    only valid for changes that keep the quaternion of unit length.
+    The trace is computed as Σ λᵢqᵢ², so that no digits cancel (λ and q are explained in the module's docstring). d² is
+    differentiable once; the derivative in `turn` is only valid for changes that keep the quaternion of unit length.
+
+    Args:
+        turn: unit quaternions of R.
+        parameter: A.
     """
     return _Trace.apply(turn.double(), parameter.double()) + SOFTENING**2
 
@@ -57,7 +61,14 @@ def log_normaliser(parameter: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*ba
 
 @torch.no_grad()
 def log_node_weights(falls: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor]:
-    """Return s at the nodes, (node,), and the log of each node's part of the normaliser, (*batch, node)."""
+    """Return the nodes s of the integral for the normaliser F(A), and the logarithms of their terms.
+
+    Args:
+        falls: λ, as in the module's docstring.
+
+    Returns:
+        s, (node,), and the logarithm of the term of each node in the sum for F(A), (*batch, node).
+    """
     scale, log_part = _scales(falls)
     log_mean, _ = _log_mean(falls.unsqueeze(-2) * scale.unsqueeze(-1), moments=False)
     return scale, log_part + log_mean

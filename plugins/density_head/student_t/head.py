@@ -85,8 +85,9 @@ class StudentTHead(HeadOfReals):
         return StudentT(location, scale, freedom)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return the negative log-likelihood of each sample, nats, without the calibrated numbers.
+        """Return the negative log-likelihood of each sample, nats.
 
+        With `degrees_of_freedom="calibrated"` it is that of a normal density, without the factor that `calibrate` sets.
         `balance` changes its gradient, not its value.
         """
         location, scale, freedom = self._parts(raw)

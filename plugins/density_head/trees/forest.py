@@ -31,7 +31,15 @@ def at_most(threshold: np.ndarray) -> np.ndarray:
 @compiled
 @no_type_check
 def leaves(samples, feature, threshold, branch, root):
-    """Return the leaf of each sample in each tree, (tree, sample) int32, for samples (sample, feature) float32."""
+    """Return the leaf of each sample in each tree, (tree, sample) int32.
+
+    Args:
+        samples: (sample, feature) float32.
+        feature: see the module.
+        threshold: see the module.
+        branch: see the module.
+        root: see the module.
+    """
     leaf = np.empty((len(root), len(samples)), np.int32)
     for tree in range(len(root)):
         for sample in range(len(samples)):

@@ -19,7 +19,7 @@ TABLES: dict[str, dict[str, np.ndarray]] = {
     "float32": _read("table/float32/"),
     "float64": _read("table/float64/"),
 }
-"""Coefficients of the polynomials, (power, piece) in float64, by the dtype that is computed and by function.
+"""Coefficients of the polynomials, (power, piece) in float64, by the dtype of the results and the function's name.
 
 v = 2/(κ+2) is in [0, 1], which is divided into equal pieces; y ∈ [-1, 1] is the position of v in its piece. Row j holds
 the coefficient of y^j on each piece, in ascending order of v.
@@ -31,7 +31,9 @@ BORDERS: tuple[float, ...] = tuple(_ARRAYS["borders"].tolist())
 CHAINS: dict[str, tuple[tuple[float, ...], ...]] = {
     name: tuple(map(tuple, array.tolist())) for name, array in _read("chain/").items()
 }
-"""Coefficients of the polynomials on the pieces between BORDERS, by function: row j holds the coefficients of y^j.
+"""Coefficients of the polynomials on the pieces between BORDERS, by the name of the function.
+
+Row j holds the coefficients of y^j, one for each piece.
 
 They are Python numbers, because a compiler writes them into its code.
 """

@@ -31,7 +31,10 @@ def _intrinsic(function: Callable[..., Any]) -> Any:
 
 @_intrinsic
 def multiply_add(typing, first, second, third):
-    """Return first · second + third, rounded once."""
+    """Return first · second + third, rounded once.
+
+    Compiled code calls the function without `typing`, which numba adds.
+    """
 
     def generate(context, builder, sig, values):
         return builder.fma(*values)
@@ -50,13 +53,19 @@ def _same_bits(source: Any, kind: Any) -> tuple[Any, Callable[..., Any]]:
 
 @_intrinsic
 def bits_of(typing, number):
-    """Return the integer of 32 or 64 bits that has the same bits as a floating-point number."""
+    """Return the integer of 32 or 64 bits that has the same bits as a floating-point number.
+
+    Compiled code calls the function without `typing`, which numba adds.
+    """
     return _same_bits(number, types.int32 if number == types.float32 else types.int64)
 
 
 @_intrinsic
 def number_of(typing, bits):
-    """Return the floating-point number that has the same bits as an integer of 32 or 64 bits."""
+    """Return the floating-point number that has the same bits as an integer of 32 or 64 bits.
+
+    Compiled code calls the function without `typing`, which numba adds.
+    """
     return _same_bits(bits, types.float32 if bits == types.int32 else types.float64)
 
 
@@ -65,7 +74,8 @@ def use_widest_registers(typing):
     """Let the loops of the calling function use registers of 512 bits where the processor has them.
 
     The compiler uses 256 bits by default, since older processors lower their frequency otherwise; the loops of this
-    file take 25 % longer with 256 bits on a processor of 2023.
+    file take 25 % longer with 256 bits on a processor of 2023. Compiled code calls the function without `typing`, which
+    numba adds.
     """
 
     def generate(context, builder, sig, values):
@@ -235,7 +245,18 @@ def _(value, mean, concentration):
 @compiled
 @no_type_check
 def log_prob(value, mean, concentration, result):
-    """Fill `result` with log p, nats; return 0, or another number if other code must compute an element."""
+    """Fill `result` with the log-density, nats.
+
+    Args:
+        value: angles φ, radians.
+        mean: μ, radians.
+        concentration: κ.
+        result: filled with log p(φ).
+
+    Returns:
+        0 if all elements are valid. Another number if a difference φ-μ is too large for these functions, or a κ is
+        negative or NaN; all elements must then be computed by other code.
+    """
     use_widest_registers()
     lost = 0
     for i in range(len(result)):
@@ -248,7 +269,19 @@ def log_prob(value, mean, concentration, result):
 @compiled
 @no_type_check
 def log_prob_and_slopes(value, mean, concentration, result, by_mean, by_concentration):
-    """Fill `result` as `log_prob`, and other arrays with its derivatives with respect to the mean and to κ."""
+    """Fill `result` with the log-density, nats, and two further arrays with its derivatives.
+
+    Args:
+        value: angles φ, radians.
+        mean: μ, radians.
+        concentration: κ.
+        result: filled with log p(φ).
+        by_mean: filled with the derivative of log p with respect to μ.
+        by_concentration: filled with the derivative of log p with respect to κ.
+
+    Returns:
+        0, or another number if other code must compute the elements, as `log_prob`.
+    """
     use_widest_registers()
     lost = 0
     for i in range(len(result)):
@@ -263,9 +296,16 @@ def log_prob_and_slopes(value, mean, concentration, result, by_mean, by_concentr
 @compiled
 @no_type_check
 def set_up(concentration, scale, floor, lanes):
-    """Fill `scale` and `floor` with the constants of the proposals for each κ, and `lanes` with 0, 1, 2, … .
+    """Fill the arrays that `propose` reads.
 
-    The proposals are described in `functions.sample`.
+    ρ is the parameter of the wrapped Cauchy density that `functions.sample` describes.
+
+    Args:
+        concentration: κ of each element.
+        scale: filled with (1-ρ)/(1+ρ), by which tan(πu/2) is multiplied to give a proposal tan(θ/2).
+        floor: filled with κ(1-ρ)²/(2ρ). A proposal is accepted with the probability c exp(1-c), where c is this number
+            plus κ(1 - cos θ).
+        lanes: filled with 0, 1, 2, …, the index of each element.
     """
     for i in range(len(concentration)):
         kappa = concentration[i]
@@ -285,16 +325,16 @@ def set_up(concentration, scale, floor, lanes):
 @compiled
 @no_type_check
 def propose(concentration, scale, floor, lanes, uniform, accept, proposed, excess, half_tangent):
-    """Draw one proposal for each of the first elements, and return how many are rejected.
+    """Draw one proposal for each remaining element, and return the number of rejected proposals.
 
-    The number of elements is the length of `uniform`. `concentration`, `scale`, `floor` and `lanes` of the rejected
-    elements move to the front of the arrays.
+    The remaining elements, as many as `uniform` has numbers, are at the front of `concentration`, `scale`, `floor` and
+    `lanes`. Afterwards, the elements with rejected proposals are at the front of these arrays, for the next call.
 
     Args:
         concentration: κ; overwritten.
         scale: constants from `set_up`; overwritten.
         floor: constants from `set_up`; overwritten.
-        lanes: position of each element in `half_tangent`; overwritten.
+        lanes: index of each element in `half_tangent`; overwritten.
         uniform: numbers drawn uniformly from [0, 1), from which the proposals are computed.
         accept: numbers drawn uniformly from [0, 1), which decide whether a proposal is accepted.
         proposed: array for intermediate results.
@@ -336,9 +376,10 @@ def propose(concentration, scale, floor, lanes, uniform, accept, proposed, exces
 @compiled
 @no_type_check
 def turn(half_tangent, mean, angle):
-    """Fill `angle` with mean + 2 arctan(half_tangent), in [-π, π]; the mean may have another dtype.
+    """Fill `angle` with mean + 2 arctan(half_tangent), wrapped to [-π, π].
 
-    Angles that need no wrapping stay exact.
+    Angles that lie in [-π, π] without wrapping are not rounded again. `mean` may have another dtype than the other
+    arrays.
     """
     beyond = 0
     for i in range(len(angle)):

@@ -8,7 +8,8 @@ FEWEST = 4096
 """Smallest number of elements that are computed by compiled code if gradients are needed, as in each training step."""
 FEWEST_ONCE = 2**18
 """Smallest number of elements, or of samples to draw, for which compiled code is used if no gradient is needed.
-The import of numba takes half a second, which few evaluations of fewer elements would not make up for.
+
+With fewer elements, a few evaluations would save less time than the half second that the import of numba takes.
 """
 
 CPU = torch.device("cpu")
@@ -22,7 +23,7 @@ def is_transformed() -> bool:
 def applies(*arguments: Tensor) -> bool:
     """Return whether compiled code can read these arguments: ordinary tensors on the CPU.
 
-    Tensors in compiled or exported programs and in transforms of torch.func have no data that it could read.
+    Tensors in compiled or exported programs and in transforms of torch.func have no data that compiled code could read.
     """
     return (
         not torch.compiler.is_compiling()
@@ -57,7 +58,7 @@ def density(value: Tensor, mean: Tensor, concentration: Tensor, *, slopes: bool)
     """Return log p; with `slopes`, also its derivatives with respect to the mean and to κ; without gradients.
 
     The arguments are broadcast and have one dtype. If compiled code does not apply, if there are too few elements, or
-    if a difference of angles is beyond its reach, the function returns None.
+    if a difference of angles is too large for compiled code, the function returns None.
     """
     # first, because an exported program must not depend on the size of a batch
     if not applies(value, mean, concentration) or value.dtype not in (torch.float32, torch.float64):
@@ -81,8 +82,13 @@ def density(value: Tensor, mean: Tensor, concentration: Tensor, *, slopes: bool)
 def sample(mean: Tensor, concentration: Tensor, block: int, rounds: int) -> Tensor | None:
     """Return one angle in [-π, π] per element, as `functions.sample` does; None if compiled code does not apply.
 
-    Both arguments have the same shape. Random numbers are drawn in the same order as by torch operations, so that
-    samples agree up to rounding.
+    Random numbers are drawn in the same order as by torch operations, so that samples agree up to rounding.
+
+    Args:
+        mean: μ, radians.
+        concentration: κ, of the same shape.
+        block: number of elements that are processed together.
+        rounds: largest number of proposals for an element.
     """
     if not applies(mean, concentration) or mean.numel() < FEWEST_ONCE:
         return None

@@ -24,7 +24,7 @@ CHANNELS = 4
 BACKGROUND = 1.0
 """Value of every channel at pixels that show no point."""
 NOTHING = torch.iinfo(torch.int64).max
-"""Key of a pixel that shows no point."""
+"""Number that stands for "no point" among the keys of `visible_points_in_torch`, which are all smaller."""
 
 
 @dataclass(frozen=True)

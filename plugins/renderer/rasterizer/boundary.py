@@ -227,10 +227,21 @@ def signed_area(screen, faces, index):
 @compiled
 @no_type_check
 def find_exit(screen, faces, index, facing, row, column, other_row, other_column):
-    """Return the edge through which the line from a pixel to another pixel leaves a face, and where on the line.
+    """Find the edge through which the line from a pixel to another pixel leaves a face.
 
-    The edge is -1 if the line does not cross an edge outwards. The second number is the position of the crossing on the
-    line: 0 at the first pixel, 1 at the other pixel. `facing` is the `signed_area` of a face of the same surface.
+    Args:
+        screen: see `raster`.
+        faces: (faces, 3), indices of vertices.
+        index: the face.
+        facing: `signed_area` of a face of the same surface.
+        row: row of the first pixel.
+        column: column of the first pixel.
+        other_row: row of the other pixel.
+        other_column: column of the other pixel.
+
+    Returns:
+        Number of the edge in the face, or -1 if the line crosses no edge outwards; and the position of the crossing on
+        the line, 0 at the first pixel and 1 at the other pixel.
     """
     share, exit_corner = np.inf, -1
     for corner in range(3):
@@ -245,9 +256,9 @@ def find_exit(screen, faces, index, facing, row, column, other_row, other_column
 @compiled
 @no_type_check
 def side(screen, a, b, row, column):
-    """Return twice the signed area, in squares of 1/256 pixel, of the triangle of the vertices `a` and `b` and a pixel.
+    """Return a number whose sign says on which side of the edge from vertex `a` to vertex `b` a pixel lies.
 
-    The sign says on which side of the edge from `a` to `b` the pixel lies.
+    It is twice the signed area of the triangle of both vertices and the pixel, in squares of 1/256 pixel.
     """
     x, y = column * SUBPIXELS, row * SUBPIXELS
     return (screen[a, 0] - x) * (screen[b, 1] - y) - (screen[b, 0] - x) * (screen[a, 1] - y)
@@ -256,7 +267,7 @@ def side(screen, a, b, row, column):
 @compiled
 @no_type_check
 def depth_at(camera_points, faces, index, ray_x, ray_y):
-    """Return the depth of a face's plane along a ray, metres."""
+    """Return the depth, metres, at which the ray (ray_x, ray_y, 1) from the camera meets the plane of face `index`."""
     a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
     bc0, bc1, bc2 = cross(
         camera_points[b, 0],

@@ -119,7 +119,12 @@ class Canvas:
     def update_pose(self, vertices: np.ndarray, pose: np.ndarray) -> bool:
         """Return whether `camera_points` and `screen` are valid for these vertices and this pose.
 
-        If they are not, make room for them and remember the vertices and the pose; the caller then fills both arrays.
+        If they are not valid, give them the right length, and store the vertices and the pose. The caller then fills
+        both arrays.
+
+        Args:
+            vertices: Vertices in world coordinates, (vertices, 3).
+            pose: All numbers of the camera on which the projection depends, as one flat array.
         """
         stored = self._vertices
         if stored.shape == vertices.shape and stored.dtype == vertices.dtype and len(self._pose) == len(pose):

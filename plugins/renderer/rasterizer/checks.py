@@ -231,7 +231,7 @@ def check_paint(scene: Scene, channels: Collection[str]) -> None:
 
 
 def check_device(name: str, tensor: Tensor) -> None:
-    """Check that a tensor is on the CPU."""
+    """Check that a tensor is on the CPU; `name` is its name in the message."""
     if tensor.device.type != "cpu":
         raise ValueError(
             f"{name} is on {tensor.device}, but rasterizer draws on the CPU, or a whole scene on cuda. Give "
@@ -242,7 +242,8 @@ def check_device(name: str, tensor: Tensor) -> None:
 def check_matrix(name: str, tensor: Tensor, columns: int | None) -> Tensor:
     """Return a floating-point matrix in a number type that kernels read, after checking its shape.
 
-    `columns` is the required number of columns; None for any number from 1.
+    `name` is the name of the matrix in messages. `columns` is the required number of columns; None for any number
+    from 1.
     """
     if tensor.ndim != 2 or tensor.shape[1] < 1 or (columns is not None and tensor.shape[1] != columns):
         expected = "1 or more channels" if columns is None else columns
@@ -251,7 +252,7 @@ def check_matrix(name: str, tensor: Tensor, columns: int | None) -> Tensor:
 
 
 def to_float(name: str, tensor: Tensor) -> Tensor:
-    """Return a floating-point tensor as float32 or float64, which kernels read."""
+    """Return a floating-point tensor as float32 or float64, which kernels read; `name` is its name in the message."""
     if not tensor.is_floating_point():
         raise ValueError(f"{name}: got {tensor.dtype}, expected floating point, e.g. torch.float32.")
     return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()
@@ -266,7 +267,7 @@ def check_colors(colors: Tensor, count: int) -> Tensor:
 
 
 def check_corners(name: str, face_indices: Tensor) -> None:
-    """Check that a tensor holds three integers per face."""
+    """Check that a tensor holds three integers per face; `name` is its name in messages."""
     if face_indices.ndim != 2 or face_indices.shape[1] != 3:
         raise ValueError(f"{name}: got the shape {tuple(face_indices.shape)}, expected ({name}, 3).")
     if face_indices.dtype not in INDEX_TYPES:
@@ -274,14 +275,20 @@ def check_corners(name: str, face_indices: Tensor) -> None:
 
 
 def check_indices(name: str, face_indices: Tensor, count: int, of: str) -> None:
-    """Check that a tensor on any device holds three indices from 0 to `count` - 1 per face."""
+    """Check that a tensor on any device holds three indices from 0 to `count` - 1 per face.
+
+    The arguments are those of `describe_out_of_range`.
+    """
     check_corners(name, face_indices)
     if face_indices.numel() and not (int(face_indices.min()) >= 0 and int(face_indices.max()) < count):
         raise ValueError(describe_out_of_range(name, face_indices, count, of))
 
 
 def to_corners(name: str, face_indices: Tensor, count: int, of: str, mesh_cache: MeshCache) -> Corners:
-    """Return face indices on the CPU in the form that kernels read, after checking that they lie below `count`."""
+    """Return face indices on the CPU in the form that kernels read, after checking that they lie below `count`.
+
+    `mesh_cache` holds the results for recent meshes. The other arguments are those of `describe_out_of_range`.
+    """
     check_corners(name, face_indices)
     readable = face_indices.dtype in (torch.int32, torch.int64)
     corners = mesh_cache.find(to_array(face_indices if readable else face_indices.long()))

@@ -232,10 +232,10 @@ def sum_gains(
 @compiled
 @no_type_check
 def add_to_camera(camera_points, axis, grad_position, lens, grad_points, grad_lens):
-    """Convert `grad_position` into gradients with respect to camera points and lens, and add them to the arrays.
+    """Convert gradients with respect to positions on the screen, and add them to `grad_points` and `grad_lens`.
 
-    `grad_position` is the gradient with respect to the vertices' positions along the screen axis `axis`, per pixel. The
-    arrays are `grad_points` and `grad_lens`.
+    `grad_position` is the gradient of the loss with respect to the position of each vertex along one axis of the screen
+    (`axis` 0: column, 1: row), per pixel.
     """
     for vertex in range(grad_position.shape[0]):
         if grad_position[vertex] != 0:

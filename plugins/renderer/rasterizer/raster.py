@@ -425,8 +425,9 @@ def _draw_far(corners, pixels, number, depth, face, mask):
 def edges(ax, ay, bx, by, cx, cy, row, column):
     """Return the three edge functions of the triangle (ax, ay), (bx, by), (cx, cy) at a pixel.
 
-    The i-th one is that of the edge opposite corner i. It is x1 y2 - x2 y1 for an edge from (x1, y1) to (x2, y2), in
-    coordinates relative to the pixel.
+    The i-th edge function belongs to the edge opposite corner i. It is x1 y2 - x2 y1 for an edge from (x1, y1) to
+    (x2, y2), in coordinates relative to the pixel. All coordinates are in 1/256 pixel, but `row` and `column` of the
+    pixel are in pixels.
     """
     x, y = column * SUBPIXELS, row * SUBPIXELS
     ax, ay, bx, by, cx, cy = ax - x, ay - y, bx - x, by - y, cx - x, cy - y
@@ -436,9 +437,9 @@ def edges(ax, ay, bx, by, cx, cy, row, column):
 @compiled
 @no_type_check
 def to_edge(ax, ay, bx, by, x, y):
-    """Return the squared distance from (x, y) to the edge from a to b, and the nearest point's position on the edge.
+    """Return the squared distance from (x, y) to the edge from (ax, ay) to (bx, by), and where the nearest point lies.
 
-    The position is 0 at a and 1 at b.
+    The second number is the position of the nearest point on the edge: 0 at (ax, ay), and 1 at (bx, by).
     """
     ux, uy, vx, vy = bx - ax, by - ay, x - ax, y - ay
     length = ux * ux + uy * uy

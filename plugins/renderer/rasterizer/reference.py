@@ -218,7 +218,15 @@ def find_nearest_on_border(
 
 
 def sample_textures(texture: Texture, face: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return texture colours (1 for faces without a texture) and texture coordinates of all pixels."""
+    """Return the texture's colour at each pixel, and the texture coordinates of each pixel.
+
+    The colour is 1 for faces without a texture and for background; the texture coordinates are then 0.
+
+    Args:
+        texture: the texture.
+        face: index of the face that each pixel shows; negative for background.
+        weights: barycentric weights of this face at each pixel, (..., 3).
+    """
     visible_face = face.clamp(min=0)
     uv = (weights[..., None] * texture.uv[texture.faces.long()[visible_face]].double()).sum(-2)
     shown = torch.zeros_like(face) if texture.shown is None else texture.shown.long()[visible_face]

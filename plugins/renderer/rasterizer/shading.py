@@ -23,8 +23,21 @@ from plugins.renderer.rasterizer.textures import find_texels, interpolate, inter
 def pixel_weights(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column):
     """Return perspective-correct barycentric weights of a face at a pixel that shows it: (w / z) / Σ (w / z).
 
-    `ax` and `ay` are column and row of the first corner in 1/256 pixel, not rounded, and `near0` is its 1 / depth; the
-    arguments of the other corners have the same meaning.
+    w are the barycentric weights of the pixel in the triangle on the screen, and z the depths of the corners. For a
+    pixel beside the triangle, the result is that of `weights_beside`.
+
+    Args:
+        ax: column of the first corner in 1/256 pixel, not rounded.
+        ay: row of the first corner in 1/256 pixel, not rounded.
+        near0: 1 / depth of the first corner, 1/metre.
+        bx: column of the second corner.
+        by: row of the second corner.
+        near1: 1 / depth of the second corner.
+        cx: column of the third corner.
+        cy: row of the third corner.
+        near2: 1 / depth of the third corner.
+        row: row of the pixel.
+        column: column of the pixel.
     """
     edge0, edge1, edge2 = edges(ax, ay, bx, by, cx, cy, row, column)
     part0, part1, part2 = edge0 * near0, edge1 * near1, edge2 * near2
@@ -38,7 +51,10 @@ def pixel_weights(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column):
 @compiled
 @no_type_check
 def weights_beside(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column):
-    """Return the weights of the point of a face that is nearest, on the screen, to a pixel beside the face."""
+    """Return the barycentric weights of the point of a face that is nearest, on the screen, to a pixel beside the face.
+
+    The arguments are those of `pixel_weights`.
+    """
     x, y = column * SUBPIXELS, row * SUBPIXELS
     to_ab, part_ab = to_edge(ax, ay, bx, by, x, y)
     to_bc, part_bc = to_edge(bx, by, cx, cy, x, y)
@@ -58,7 +74,8 @@ def weights_beside(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column):
 def weights_in_space(camera_points, a, b, c, ray_x, ray_y):
     """Return barycentric weights of a face that may have corners behind the camera, for a ray r = (ray_x, ray_y, 1).
 
-    The weights are r·(b × c), r·(c × a), r·(a × b) over their sum (Olano & Greer 1997).
+    For the corners A, B, C in camera coordinates, the weights are r·(B × C), r·(C × A), r·(A × B) over their sum (Olano
+    & Greer 1997). `a`, `b` and `c` are the indices of the corners in `camera_points`.
     """
     part0 = scalar_triple_product(camera_points, b, c, ray_x, ray_y)
     part1 = scalar_triple_product(camera_points, c, a, ray_x, ray_y)
@@ -75,7 +92,10 @@ def weights_in_space(camera_points, a, b, c, ray_x, ray_y):
 @compiled
 @no_type_check
 def scalar_triple_product(camera_points, a, b, ray_x, ray_y):
-    """Return r · (a × b) for two vertices and a ray r = (ray_x, ray_y, 1)."""
+    """Return r · (A × B) for a ray r = (ray_x, ray_y, 1) and two vertices A and B in camera coordinates.
+
+    `a` and `b` are the indices of the vertices in `camera_points`.
+    """
     ax, ay, az = camera_points[a, 0], camera_points[a, 1], camera_points[a, 2]
     bx, by, bz = camera_points[b, 0], camera_points[b, 1], camera_points[b, 2]
     return ray_x * (ay * bz - az * by) + ray_y * (az * bx - ax * bz) + (ax * by - ay * bx)
@@ -84,7 +104,7 @@ def scalar_triple_product(camera_points, a, b, ray_x, ray_y):
 @compiled
 @no_type_check
 def weights_at(camera_points, screen, faces, lens, index, row, column):
-    """Return barycentric weights of a face at a pixel that shows it."""
+    """Return barycentric weights of face `index` at the pixel (row, column), which shows this face."""
     a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
     if screen[a, 2] != 0 and screen[b, 2] != 0 and screen[c, 2] != 0:
         near0, near1, near2 = screen[a, 2], screen[b, 2], screen[c, 2]
@@ -96,7 +116,10 @@ def weights_at(camera_points, screen, faces, lens, index, row, column):
 @compiled
 @no_type_check
 def fill_color(faces, colors, texture, index, w0, w1, w2, image, row, column):
-    """Fill a pixel of an image, (height, width, channels), with the colour of a face at barycentric weights."""
+    """Fill the pixel (row, column) of an image with the colour of face `index` at the barycentric weights w0, w1, w2.
+
+    `image` has the shape (height, width, channels).
+    """
     if colors is None:
         for channel in range(image.shape[2]):
             image[row, column, channel] = 1.0
@@ -113,7 +136,10 @@ def fill_color(faces, colors, texture, index, w0, w1, w2, image, row, column):
 @compiled
 @no_type_check
 def multiply_by_texture(texture, index, w0, w1, w2, image, row, column):
-    """Multiply a pixel by the colour of the face's texture at barycentric weights; do nothing without a texture."""
+    """Multiply the pixel (row, column) of an image by the texture of face `index` at barycentric weights w0, w1, w2.
+
+    If the face has no texture, do nothing.
+    """
     if texture.shown[index] < 0:
         return
     u, v = interpolate_uv(texture, index, w0, w1, w2)

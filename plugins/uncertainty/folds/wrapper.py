@@ -100,7 +100,8 @@ class Folds(Uncertainty, SelfTraining):
     def forward(self, inputs: Tensor) -> Distribution:
         """Return the mixture of the densities of all models.
 
-        If `rows` is set, the mixture for a sample has only the models that did not see this sample in training.
+        If `rows`, the row numbers of the inputs in the training data, is set, the mixture for a sample has only the
+        models that did not see this sample in training.
         """
         groups = self._groups(inputs)
         if len(groups) == 1:

@@ -52,11 +52,12 @@ class Laplace(Uncertainty, ReadsTraining):
         covariance: "full" for all weights together; "kronecker" for a product of a matrix over raw parameters and one
             over features; "diagonal" for independent weights.
         prior_precision: λ, or how it is chosen: "marginal" by the marginal likelihood of the training split,
-            "validation" by the likelihood of the validation split; the choices then include weights without any spread.
+            "validation" by the likelihood of the validation split. "validation" may also choose an infinite λ, with
+            which all draws are the trained weights.
 
     Attributes:
         samples: S, which may be changed after training (a knob).
-        precision: λ, a float64 buffer; infinite before `calibrate`, and if weights without any spread are best.
+        precision: λ, a float64 buffer; infinite before `calibrate`, and if "validation" chooses an infinite λ.
 
     Raises:
         ConfigError: the model has no final linear layer, or too many weights for a full covariance; it is inside
