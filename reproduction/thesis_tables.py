@@ -218,13 +218,26 @@ def run_commands(commands: Sequence[Sequence[str]], *, run: bool) -> None:
 
 
 def common_overrides(table: Table, jobs: int, bfloat16: bool) -> tuple[str, ...]:
-    """Return the overrides that all runs of a table have."""
+    """Return the overrides that all runs of a table have.
+
+    Args:
+        table: The table.
+        jobs: Number of runs at the same time; a table whose sweeps have one run each uses as many threads instead.
+        bfloat16: Whether convolutional networks are trained in bfloat16.
+    """
     precision = (BFLOAT16,) if bfloat16 and table.convolves else ()
     return (*precision, *COMMON_OVERRIDES, f"threads={jobs if table.alone else 1}")
 
 
 def commands(name: str, seeds: int, jobs: int, bfloat16: bool) -> tuple[list[list[str]], list[list[str]]]:
-    """Return the commands of the sweeps of a table, and the commands that write its pages."""
+    """Return the commands of the sweeps of a table, and the commands that write its pages.
+
+    Args:
+        name: Number of the table, such as "2.1".
+        seeds: Largest number of seeds of a sweep.
+        jobs: Number of runs at the same time.
+        bfloat16: Whether convolutional networks are trained in bfloat16.
+    """
     table = TABLES[name]
     sweep_commands = [
         [
@@ -379,7 +392,7 @@ def link(script: str) -> str:
 
 
 def count_runs(words: Sequence[str], seeds: int) -> int:
-    """Return the number of runs of a sweep."""
+    """Return the number of runs of a sweep with the overrides `words`; `seeds` counts if these name no seed."""
     return len(expand_sweep(words)) * (1 if any(word.startswith("seed=") for word in words) else seeds)
 
 

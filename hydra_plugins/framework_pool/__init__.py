@@ -82,7 +82,12 @@ class EngineLauncher(Launcher):
         require_enclosed(Path(str(config.hydra.sweep.dir)))  # before Hydra writes multirun.yaml into it
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
-        """Run the jobs and return their results; some sweepers call this method once for each batch of jobs."""
+        """Run the jobs and return their results; some sweepers call this method once for each batch of jobs.
+
+        Args:
+            job_overrides: Overrides of each job.
+            initial_job_idx: Number of the first job.
+        """
         # imported late: Hydra imports this module at every start
         from framework.sweeps import comparison
 

@@ -27,7 +27,13 @@ def draw(space: Mapping[str, Domain], trials: int, seed: int) -> tuple[list[list
 
 
 def quantile(seed: int, trial: int, key: str) -> float:
-    """Return a pseudo-random number, uniform in [0, 1), that depends on the arguments only, not on the machine."""
+    """Return a pseudo-random number, uniform in [0, 1), that is the same on every machine.
+
+    Args:
+        seed: Seed of the search.
+        trial: Number of the trial.
+        key: Key of the override whose value is drawn.
+    """
     digest = sha256(f"{seed}\0{trial}\0{key}".encode()).digest()
     return (int.from_bytes(digest[:8], "big") >> 11) * 2.0**-53  # the 53 bits a float can hold
 

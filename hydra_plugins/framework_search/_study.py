@@ -386,7 +386,7 @@ class SeededSampler(BaseSampler):
         self.before_trial(None, None)
 
     def before_trial(self, study: Any, trial: Any) -> None:
-        """Seed the sampler for a trial."""
+        """Seed the sampler by the number of a trial; None for `trial` seeds it before the first trial."""
         number = -1 if trial is None else trial.number
         seed, other = (_seed(self.settings.seed, number, use) for use in ("sampler", "independent"))
         # Mutations of NSGA-II are drawn independently. Optuna gives the same seed to both, which would correlate them.
@@ -406,19 +406,19 @@ class SeededSampler(BaseSampler):
                     self._sampler = QMCSampler(seed=_seed(self.settings.seed, 0, "sampler"), scramble=True)
 
     def infer_relative_search_space(self, study: Any, trial: FrozenTrial) -> dict[str, BaseDistribution]:
-        """Return the parameters that are drawn together."""
+        """Return the parameters that the sampler draws jointly (Optuna's relative search space)."""
         return self._sampler.infer_relative_search_space(study, trial)
 
     def sample_relative(
         self, study: Any, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
     ) -> dict[str, Any]:
-        """Draw the parameters that are drawn together."""
+        """Draw the parameters in `search_space` jointly, and return their values by name."""
         return self._sampler.sample_relative(study, trial, search_space)
 
     def sample_independent(
         self, study: Any, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
     ) -> Any:
-        """Draw one parameter."""
+        """Draw one parameter independently of the others, and return its value."""
         sampler = self._independent or self._sampler
         return sampler.sample_independent(study, trial, param_name, param_distribution)
 

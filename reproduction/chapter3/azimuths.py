@@ -130,7 +130,8 @@ def _score_batch(density: Distribution, azimuth: Tensor) -> tuple[Tensor, ...]:
 def score_run(run: Path, loaders: dict[str, Batches]) -> ImageScores | None:
     """Return the results of a trained model on the test images of its class.
 
-    The result is None if the objects of the class look the same from several sides.
+    The result is None if the objects of the class look the same from several sides. `loaders` holds the data of the
+    classes that were loaded before; a missing class is added.
     """
     model, description = load_with_description(run)
     category = str(description.config["data"]["category"])

@@ -222,7 +222,12 @@ def error_table(results: dict[str, list[FlightErrors]]) -> list[str]:
 
 
 def error_rows(flights: str, results: dict[str, list[FlightErrors]]) -> Iterator[dict[str, object]]:
-    """Yield the rows of the CSV file: the mean error of each method and seed at each frame."""
+    """Yield the rows of the CSV file: the mean error of each method and seed at each frame.
+
+    Args:
+        flights: Kind of the flights, for the column of this name.
+        results: Results of each method, one for each seed.
+    """
     for method, several in results.items():
         for seed, result in zip(SEEDS, several, strict=False):
             for frame, error in enumerate(result.growth.tolist(), 1):
@@ -336,7 +341,14 @@ def write_results(
     latencies: list[str],
     nearest_text: str,
 ) -> None:
-    """Write the page, the CSV file and both figures."""
+    """Write the page, the CSV file and both figures.
+
+    Args:
+        simulated: Results of each method on simulated flights.
+        recorded: Results of each method on recorded flights, one for each seed.
+        latencies: Rows of the table of run times.
+        nearest_text: Text about the errors of `nearest_window_errors`.
+    """
     text = [
         "# Predicted ball flights: error against time", "",
         "This page repeats Figure 4.3 of the thesis: four methods observe a table-tennis ball for some frames and "

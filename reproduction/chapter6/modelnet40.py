@@ -248,7 +248,12 @@ def seed_variance(values: Float[np.ndarray, "seeds clouds"]) -> float:
 
 
 def pooled_seed_variance(methods: Mapping[str, Method], score: str) -> float:
-    """Return the mean of `seed_variance` over all rows with several seeds, or NaN if there is none."""
+    """Return the mean of `seed_variance` over all methods with several seeds, or NaN if there is none.
+
+    Args:
+        methods: Scores of each method.
+        score: Name of the score, "accuracy" or "nll".
+    """
     variances = [
         seed_variance(getattr(method, score)) for method in methods.values() if len(method.accuracy) > 1
     ]
@@ -304,9 +309,12 @@ def claims_table(methods: Mapping[str, Method]) -> str:
 
 
 def score_clouds(model: Any, clouds: Tensor, labels: Tensor) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return for each test cloud whether its class is predicted and the negative log-likelihood, and seconds per cloud.
+    """Score the predictions of a model for all test clouds, and measure their time.
 
-    The time is the median over batches, because the first batch also warms up.
+    Returns:
+        For each cloud 1 if the likeliest class is the true one and 0 otherwise; for each cloud the negative
+        log-likelihood of the true class, nats; and the seconds per cloud. The time is the median over batches, because
+        the first batch also warms up.
     """
     right, nll, seconds = [], [], []
     with torch.inference_mode():

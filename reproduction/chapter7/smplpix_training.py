@@ -130,7 +130,10 @@ def write_record(rows: Record) -> None:
 
 
 def is_same_run(row: Row, known: Row) -> bool:
-    """Return whether two rows hold the same runs, so that the recorded minutes, machine and date stay."""
+    """Return whether a new row holds the same runs as the recorded row `known`.
+
+    The recorded minutes, machine and date are then kept.
+    """
     same = all(math.isclose(row.means[key], known.means[key], rel_tol=1e-5) for key in COLUMNS)
     return same and row.seeds == known.seeds
 
@@ -143,7 +146,7 @@ def run_training(method: Method, epochs: int, seed: int) -> None:
 
 
 def read_runs(method: Method, epochs: int) -> Row | None:
-    """Return the row of a method from its run folders, or None if no run has finished."""
+    """Return the row of a method trained for `epochs` epochs, from its run folders; None if no run has finished."""
     folders = [method.place(epochs, seed) for seed in method.seeds[epochs]]
     finished = [folder for folder in folders if (folder / "results.json").is_file()]
     if not finished:
@@ -173,7 +176,15 @@ def epoch_minutes(method: Method) -> float:
 
 
 def crossing(minutes: Sequence[float], values: Sequence[float], level: float) -> str:
-    """Return in words when a curve rises above a level, interpolated linearly in the logarithm of time."""
+    """Return in words after how many minutes a curve rises above a level.
+
+    The curve is interpolated linearly in the logarithm of time.
+
+    Args:
+        minutes: Times of the points of the curve, ascending.
+        values: Values of the points.
+        level: The level.
+    """
     for first, (before, after) in enumerate(pairwise(values)):
         if before <= level < after:
             share = (level - before) / (after - before)
@@ -351,7 +362,12 @@ def draw_curves(rows: Record, place: Path) -> None:
 
 @torch.inference_mode()
 def draw_people(place: Path, chosen: Sequence[int] = (0, 20, 44, 75)) -> None:
-    """Draw photographs of unseen people, their images and the errors; keep the old figure if a run does not exist."""
+    """Draw photographs of unseen people, their images and the errors; keep the old figure if a run does not exist.
+
+    Args:
+        place: Path of the figure.
+        chosen: Indices of the test images to draw.
+    """
     names = {BASELINE: 0, "points alone, 7k": 20, "over the mesh, 7k": 20}
     runs = [METHODS[name].place(epochs, 0) for name, epochs in names.items()]
     if not all((run / "results.json").is_file() for run in runs):

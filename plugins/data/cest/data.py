@@ -212,7 +212,10 @@ class CEST(Data, Mapped):
         return Fields(input=spectra, index=torch.arange(len(spectra)))
 
     def write_maps(self, file: Path, point: Tensor, deviation: Tensor, folder: Path) -> Sequence[Path]:
-        """Write the maps of the predictions for a volume and return the paths of the files."""
+        """Write the maps of the predictions for a volume and return the paths of the files.
+
+        The arguments are those of `plugins.data.cest.maps.write_maps`.
+        """
         from plugins.data.cest.maps import write_maps
 
         return write_maps(file, self.parameters.target, point, deviation, folder, synthetic=self.synthetic)

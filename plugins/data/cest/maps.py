@@ -61,7 +61,8 @@ def maps_of(
 ) -> dict[str, np.ndarray]:
     """Return the maps (x, y, z) by name, NaN where there is no voxel; amplitudes are shares of the unsaturated signal.
 
-    The maps are the asymmetry, each predicted number, and each standard deviation.
+    The maps are the asymmetry, each predicted number, and each standard deviation. `names`, `point` and `deviation` are
+    as in `write_maps`.
     """
     columns = {ASYMMETRY: asymmetry(volume)}
     for number, name in enumerate(names):

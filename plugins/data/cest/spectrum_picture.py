@@ -9,7 +9,7 @@ LINE, BELOW = (31, 119, 180), (222, 235, 247)
 
 
 def curve(values: Float[np.ndarray, "offset"]) -> UInt8[np.ndarray, "height width 3"]:
-    """Return an image of the curve, blue on white, with the area below it filled."""
+    """Return an image of the curve of Z (`values`) over the offsets, blue on white, with the area below it filled."""
     canvas = np.full((HEIGHT, PITCH * len(values), 3), 255, np.uint8)
     top = np.rint((1 - np.nan_to_num(values).clip(0, 1.05) / 1.05) * (HEIGHT - 2)).astype(int)
     for offset, row in enumerate(top):

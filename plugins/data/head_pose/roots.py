@@ -86,7 +86,7 @@ def write_caviar(root: Path) -> Path:
 
 
 def publish_caviar(root: Path, train: Iterable[int] = range(20), test: Iterable[int] = range(20, 31)) -> None:
-    """Write the CAVIAR labels of the images with these numbers."""
+    """Write the CAVIAR labels of the images with the numbers `train` and `test` into the folder `root`."""
     save_caviar(root, struct_array([*map(caviar_row, train)]), struct_array([*map(caviar_row, test)]))
 
 
@@ -101,7 +101,7 @@ def save_caviar(root: Path, train: np.ndarray, test: np.ndarray) -> None:
 
 
 def struct_array(rows: Sequence[Sequence[Any]], names: Sequence[str] = CAVIAR_FIELDS) -> np.ndarray:
-    """Return a MATLAB struct array with one element for each row."""
+    """Return a MATLAB struct array with one element for each row, whose fields have the names `names`."""
     array = np.empty((1, len(rows)), dtype=[(name, object) for name in names])
     for index, row in enumerate(rows):
         array[0, index] = tuple(row)

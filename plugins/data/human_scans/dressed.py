@@ -149,7 +149,13 @@ class Wardrobe:
     def scan(
         self, posed: Float[np.ndarray, "vertices 3"], worn: Clothes, random: Generator
     ) -> tuple[Scan, Bool[np.ndarray, "points"]]:
-        """Return the scan of a dressed person in a pose, and which of its points a scanner sees."""
+        """Return the scan of a dressed person in a pose, and which of its points a scanner sees.
+
+        Args:
+            posed: vertices of the bare body in the pose, metres.
+            worn: clothes and hair of the person.
+            random: source of the folds of a skirt, of loose hair and of the light.
+        """
         where = self.anatomy
         draped = self.sheet.interpolate(self._smoothed(posed, worn.cover[: self.vertices]))
         vertices = draped + worn.raised[:, None] * self.normals(draped)
@@ -270,7 +276,10 @@ class Light:
         self.key = random.uniform(0.35, 0.6)
 
     def on(self, piece: Piece, normals: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
-        """Return the linear RGB that the matt surface `piece` reflects under this light."""
+        """Return the linear RGB that the matt surface `piece` reflects under this light at each of its vertices.
+
+        `normals` are the outward unit normals at the vertices.
+        """
         around = 0.62 + 0.22 * normals[:, 1]
         side = ((normals @ self.towards + 0.3) / 1.3).clip(0, 1)
         return piece.colors * (around + self.key * side)[:, None]

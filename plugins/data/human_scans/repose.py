@@ -192,7 +192,12 @@ def around(vertices: Float[Tensor, "vertex 3"], views: int, size: tuple[int, int
 
 
 def read(file: Path, topology: str) -> tuple[str, RegisteredMesh]:
-    """Return name and mesh of a registration, or of a subject's folder."""
+    """Return name and mesh of a registration.
+
+    Args:
+        file: file of the mesh, or a subject's folder of `human_scans`.
+        topology: name of the topology whose mesh is read from a subject's folder.
+    """
     if file.is_dir():
         return file.resolve().name, scan_layout.read_registration(file / f"registration_{topology}.ply")
     return file.stem, scan_layout.read_registration(file)

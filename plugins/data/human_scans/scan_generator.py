@@ -65,7 +65,13 @@ class Drawing:
 
 
 def scans_root(renderer: Renderer, counts: Mapping[str, int], drawing: Drawing, seed: int) -> Path:
-    """Return the folder of generated people in the cache; they are generated if they are not there.
+    """Return the folder of generated people in the cache, after generating them if it does not exist.
+
+    Args:
+        renderer: renderer that draws the photographs.
+        counts: number of subjects of each split, by its name.
+        drawing: settings of the people and of the photographs.
+        seed: seed of all random draws.
 
     Raises:
         DataError: the body or the skins are not available or cannot be read.
@@ -165,7 +171,7 @@ class Crowd:
             Image.fromarray(pixels).save(folder / "texture.png")
 
     def person(self, split: str, number: int) -> Person:
-        """Return the shape, the pose and the skin of a person, without clothes."""
+        """Return the shape, the pose and the skin of person `number` of a split, without clothes."""
         random = np.random.default_rng([self.seed, SPLITS.index(split), number])
         skin = None
         if some := self.skins[SPLITS.index(split)]:

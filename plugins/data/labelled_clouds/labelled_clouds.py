@@ -138,7 +138,11 @@ def load_listed(
 
 
 def describe_unread(listed: FileList, reading: Reading) -> tuple[str, ...]:
-    """Return clauses about what is not read: files of other kinds, and columns of the first file."""
+    """Return clauses for a message that say which parts of the user's files are not read.
+
+    They name the number of files of other kinds, and the columns of the first file that are not read. If the first file
+    is a mesh, a clause says that points are drawn from its faces.
+    """
     remarks = []
     if listed.ignored:
         remarks.append(f"left out: {listed.ignored} files of other kinds")

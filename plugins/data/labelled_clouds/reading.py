@@ -147,14 +147,22 @@ def read_cloud(file: Path, reading: Reading) -> Float32[np.ndarray, "points colu
 
 
 def subsample(table: NDArray, points: int | None, random: np.random.Generator) -> NDArray:
-    """Return at most `points` rows, drawn without replacement and in their order; all rows if `points` is None."""
+    """Return at most `points` rows of `table`, drawn without replacement; all rows if `points` is None.
+
+    The rows keep their order.
+    """
     if points is None or len(table) <= points:
         return table
     return table[np.sort(random.choice(len(table), points, replace=False))]
 
 
 def round_to_float32(table: NDArray, source: str, *, centred: bool) -> Float32[np.ndarray, "points columns"]:
-    """Return a cloud as float32, after subtracting its mean if `centred` is true.
+    """Return a cloud as float32, after subtracting the mean of its coordinates if `centred` is true.
+
+    Args:
+        table: the points; the coordinates are the first three columns.
+        source: name of the cloud in messages.
+        centred: whether the mean is subtracted.
 
     Raises:
         DataError: The coordinates exceed float32, or are so far from 0 that rounding would blur the shape.

@@ -49,7 +49,10 @@ def draw(size: int, noise: float, *key: int) -> tuple[Float[np.ndarray, "size 2"
 
 
 def log_density(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[np.ndarray, "*batch 2"]:
-    """Return log p(x | y) for y = 0 and 1, nats, of points in standard units; finite for every finite float32."""
+    """Return log p(x | y) for y = 0 and 1, nats, of points in standard units; finite for every finite float32.
+
+    `noise` is the standard deviation of the noise, in radii.
+    """
     distance, log_integral = _polar_terms(points, noise)
     # |x - (cos θ, sin θ)|² = (d - 1)² + 4 d sin²(t/2), where d is x's distance from the circle's centre and t the
     # angle between x and the point of the arc
@@ -59,7 +62,10 @@ def log_density(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[np
 
 
 def log_posterior(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[np.ndarray, "*batch 2"]:
-    """Return log p(y | x) for y = 0 and 1, with equal prior probabilities, of points in standard units."""
+    """Return log p(y | x) for y = 0 and 1, with equal prior probabilities, of points in standard units.
+
+    `noise` is the standard deviation of the noise, in radii.
+    """
     distance, log_integral = _polar_terms(points, noise)
     total = distance.sum(-1)
     # log p(x | 1) - log p(x | 0) without the cancellation of large squares: if p is the point measured from the centre
@@ -70,7 +76,10 @@ def log_posterior(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[
 
 
 def posterior(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[np.ndarray, "*batch 2"]:
-    """Return p(y | x) for y = 0 and 1, the best possible prediction."""
+    """Return p(y | x) for y = 0 and 1, the best possible prediction, of points in standard units.
+
+    `noise` is the standard deviation of the noise, in radii.
+    """
     return np.exp(log_posterior(points, noise))
 
 

@@ -87,7 +87,13 @@ def split_of(inputs: Float32[Tensor, "size 2"], label: Int[np.ndarray, "size"], 
 
 
 def fingerprint(version: str, splits: Sequence[Fields], **parameters: object) -> dict[str, str]:
-    """Return the entries that identify a data set: its parameters, the sizes of its splits, a hash of its points."""
+    """Return the entries that identify a data set: its parameters, the sizes of its splits, a hash of its points.
+
+    Args:
+        version: Version of the generator.
+        splits: The three splits.
+        parameters: Parameters of the data set, by name.
+    """
     digest = hashlib.sha256()
     for split in splits:
         digest.update(split.fields["input"].numpy().tobytes())

@@ -72,7 +72,7 @@ class Framing:
     margin: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False)] = 0.1
 
     def crop(self, annotation: Annotation) -> Crop:
-        """Return the crop of an annotated object."""
+        """Return the settings that read the crop of an annotated object from its image."""
         return Crop(annotation.image, annotation.box, self.margin, self.image_size)
 
     def scale(self, box: Box) -> float:
@@ -292,7 +292,10 @@ class Pascal3D(Data):
 
 
 def reason_to_exclude(annotation: Annotation, include_occluded: bool) -> str | None:
-    """Return why the protocol leaves an object out; None if it uses the object."""
+    """Return why the protocol leaves an object out; None if it uses the object.
+
+    `include_occluded` says whether truncated and occluded objects are used.
+    """
     if annotation.angles is None:
         return "without a fine label"
     if annotation.difficult:

@@ -122,6 +122,12 @@ def read_list(file: Path) -> list[str]:
 def read_annotations(root: Path, category: str, source: str, name: str) -> list[Annotation]:
     """Return the objects of class `category` in one annotation file.
 
+    Args:
+        root: The unpacked release.
+        category: Name of the class.
+        source: Source of the image, "pascal" or "imagenet".
+        name: Name of the image, without its ending.
+
     Raises:
         DataError: The file is missing, is not a MATLAB file, or does not have the structure of an annotation.
     """

@@ -31,6 +31,6 @@ def wood(random: Generator) -> Color:
 
 
 def shade(color: Color, factor: float) -> Color:
-    """Return a brighter or darker colour, within [0, 1]."""
+    """Return a colour multiplied by a factor and clamped to [0, 1]; a factor above 1 makes it brighter."""
     red, green, blue = (min(1.0, max(0.0, factor * part)) for part in color)
     return red, green, blue

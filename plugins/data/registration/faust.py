@@ -46,22 +46,25 @@ class Pair(NamedTuple):
 
 
 def training_scan(folder: Path, number: int) -> Path:
-    """Return the path of a training scan."""
+    """Return the path of training scan `number`, 0 to 99."""
     return folder / "training" / "scans" / f"tr_scan_{number:03}.ply"
 
 
 def training_registration(folder: Path, number: int) -> Path:
-    """Return the path of the registration of a training scan."""
+    """Return the path of the registration of training scan `number`, 0 to 99."""
     return folder / "training" / "registrations" / f"tr_reg_{number:03}.ply"
 
 
 def test_scan(folder: Path, number: int) -> Path:
-    """Return the path of a test scan."""
+    """Return the path of test scan `number`."""
     return folder / "test" / "scans" / f"test_scan_{number:03}.ply"
 
 
 def test_registration(folder: Path, number: int) -> Path:
-    """Return the path of the registration of a test scan, which only generated people have; FAUST publishes none."""
+    """Return the path of the registration of test scan `number`.
+
+    Only generated people have registrations of test scans; FAUST publishes none.
+    """
     return folder / "test" / "registrations" / f"test_reg_{number:03}.ply"
 
 

@@ -81,6 +81,14 @@ def ensure_solid(
 ) -> Path:
     """Return the folder of the images of a solid, after generating them if it does not exist.
 
+    Args:
+        parent: folder of the folders of all solids.
+        name: name of the solid.
+        counts: number of images of each split, by its name.
+        size: side of the images, pixels.
+        seed: seed of the rotations.
+        renderer: renderer that draws the images.
+
     Raises:
         DataError: the cache cannot be written, or holds other data under the same name.
     """

@@ -245,5 +245,8 @@ def _same(first: Flight, second: Flight) -> bool:
 
 
 def count_missing_frames(flight: Flight, step: float) -> int:
-    """Return how many frames are missing, according to the times of the other frames."""
+    """Return how many frames are missing, according to the times of the other frames.
+
+    `step` is the time from frame to frame, s.
+    """
     return int(np.maximum(np.rint(np.diff(flight.times) / step) - 1, 0).sum())

@@ -63,6 +63,11 @@ class Simulation:
 def ensure_simulated(simulation: Simulation, constants: Constants, step: float) -> Path:
     """Return the folder of simulated flights in the cache, after simulating the flights if it does not exist.
 
+    Args:
+        simulation: Settings of the flights.
+        constants: Constants of the ball and the table.
+        step: Time from frame to frame, s.
+
     Raises:
         DataError: The cache cannot be written, or a solver gave up.
     """
@@ -76,7 +81,10 @@ def ensure_simulated(simulation: Simulation, constants: Constants, step: float) 
 
 
 def write(root: Path, simulation: Simulation, constants: Constants, step: float) -> None:
-    """Write one CSV file per flight, with the observed t, x, y, z and the true positions true_x, true_y, true_z."""
+    """Write one CSV file per flight, with the observed t, x, y, z and the true positions true_x, true_y, true_z.
+
+    The arguments after `root` are those of `ensure_simulated`.
+    """
     seed = simulation.generator_seed
     starts = [draw_start(stream(seed, f"start {number}")) for number in range(simulation.flights)]
     times = np.arange(0, LONGEST, step)
@@ -123,6 +131,12 @@ def simulate_positions(
     constants: Constants,
 ) -> Float[np.ndarray, "flight time 3"]:
     """Return the positions of flights at given times, without noise.
+
+    Args:
+        starts: Position, velocity and spin of each flight at its first time.
+        times: Increasing times of each flight, s.
+        simulation: Settings of the contact with the table.
+        constants: Constants of the ball and the table.
 
     Raises:
         DataError: The solver of the stiff contact gave up.

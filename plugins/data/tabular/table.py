@@ -307,6 +307,12 @@ def as_float32(
 ) -> Float[Tensor, "row column"]:
     """Return the values in single precision.
 
+    Args:
+        cells: The table from which the values come, for the message.
+        columns: Name of each column of `values`.
+        rows: Index in the table of each row of `values`.
+        values: The values.
+
     Raises:
         DataError: A number is too large for single precision; the message names line and column.
     """

@@ -292,7 +292,8 @@ def blur(
 def gaussian_matrix(length: int, deviation: float) -> Float[Tensor, "length length"]:
     """Return the matrix that convolves a row of `length` pixels with a Gaussian.
 
-    For few pixels, multiplying with it is faster than a convolution.
+    `deviation` is the standard deviation in pixels. For few pixels, multiplying by the matrix is faster than a
+    convolution.
     """
     distance = torch.arange(length)[:, None] - torch.arange(length)
     weights = (

@@ -95,7 +95,10 @@ class Networks(Latent):
         return torch.cat([self.decode(part) for part in z.split(self.at_once(len(z)))]).movedim(0, -2)
 
     def log_weights(self, value: Tensor, items: Tensor, noise: Tensor) -> Tensor:
-        """Return the log of the importance weights of z that are drawn from q(z|x,φ), nats (eq. 3.19)."""
+        """Return the log of the importance weights of z that are drawn from q(z|x,φ), nats (eq. 3.19).
+
+        Arguments and shapes are those of `Latent.log_weights`.
+        """
         return importance_log_weights(self.rows(items), value, noise)
 
     def sample(self, count: int) -> Tensor:

@@ -132,7 +132,13 @@ class Latent(ABC):
 
 
 def sampled_mixture(latent: Latent, points: NormalPoints, effort: Effort) -> SampledMixture:
-    """Return the mixture, with equal weights, of the components at S points z (eq. 3.21)."""
+    """Return the mixture, with equal weights, of the components at S points z (eq. 3.21).
+
+    Args:
+        latent: networks of the head, applied to a batch of inputs x.
+        points: sequences of standard normal points, of which the first ones are used.
+        effort: number S of points, and number of replicates.
+    """
     items = torch.arange(latent.items, device=latent.center.device)
     number = latent.numbers(points(items, 0, effort.first).flatten(0, 1))
     weights = torch.zeros(number.shape[:-1], dtype=number.dtype, device=number.device)

@@ -175,7 +175,10 @@ def estimate_from_sums(
 
 
 def estimated_error(result: Estimate) -> Float[Tensor, "*items"]:
-    """Return the root mean square error of `log_mean`, nats: √(s² + (s²/2)²) for the standard error s and bias s²/2."""
+    """Return the estimated root mean square error of `result.log_mean`, nats.
+
+    It is √(s² + (s²/2)²) for the standard error s and the bias s²/2.
+    """
     return torch.hypot(result.standard_error, result.standard_error.square() / 2)
 
 

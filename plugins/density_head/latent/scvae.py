@@ -50,7 +50,10 @@ class Networks(Latent):
         return torch.cat([self.decode(raw, part) for part in z.split(self.at_once(z.shape[-2]), -2)], -2)
 
     def log_weights(self, value: Tensor, items: Tensor, noise: Tensor) -> Tensor:
-        """Return the component's log-density at each z, nats (eq. 3.21)."""
+        """Return the component's log-density at each z, nats (eq. 3.21).
+
+        Arguments and shapes are those of `Latent.log_weights`.
+        """
         raw = self.raw.reshape(-1, self.raw.shape[-1])[items]
         return self.component(self.decode(raw, noise)).log_prob(value)
 

@@ -4,7 +4,7 @@ from framework.heads.rotations import MatrixHead
 from plugins.density_head.matrix_fisher.density import MatrixFisher
 
 LARGEST_PARAMETER = 1e12
-"""Largest Frobenius norm of F, for standard deviations of a microradian, which is the resolution of float32 angles."""
+"""Largest Frobenius norm of F; it gives standard deviations of a microradian, the resolution of float32 angles."""
 
 
 class MatrixFisherHead(MatrixHead):

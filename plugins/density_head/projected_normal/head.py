@@ -12,7 +12,7 @@ from framework.target import Target
 from plugins.density_head.projected_normal.density import ProjectedNormal
 
 LARGEST_MEAN = 1e6
-"""Largest |μ|, for a standard deviation of a microradian, which is the resolution of float32 angles."""
+"""Largest |μ|; it gives a standard deviation of a microradian, which is the resolution of float32 angles."""
 LARGEST_FACTOR = 3.0
 """Bound of s and t, so that standard deviations in two directions differ by a factor of a few hundred at most."""
 

@@ -23,7 +23,7 @@ WIDEST = 1e18
 
 
 def require_class_or_real(target: Target, by: str) -> None:
-    """Require a target of classes or real numbers.
+    """Require a target of classes or real numbers; `by` is the subject of the message, such as the head's name.
 
     Raises:
         ConfigError: the target is an angle or an image.
@@ -37,6 +37,11 @@ def require_class_or_real(target: Target, by: str) -> None:
 
 def require_fitted(raw: Float[Tensor, "*batch size"], size: int, by: str) -> Float[Tensor, "*batch size"]:
     """Return `raw`, with half precision converted to float32.
+
+    Args:
+        raw: features that the head reads.
+        size: number of features to which the head was fitted.
+        by: subject of the message, such as the head's name.
 
     Raises:
         UserError: `size` is 0, as it is before `fit`.

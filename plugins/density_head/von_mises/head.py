@@ -16,7 +16,7 @@ from plugins.density_head.von_mises.angles import half_angle
 from plugins.density_head.von_mises.density import VonMises
 
 LARGEST_CONCENTRATION = 1e12
-"""Largest κ, for a standard deviation of a microradian, which is the resolution of float32 angles."""
+"""Largest κ; its standard deviation is a microradian, which is the resolution of float32 angles."""
 LEAST_SCALE = 0.25
 """Smallest value of the scale g(r), so that κ can reach 0 only if the pair (cos, sin) does.
 

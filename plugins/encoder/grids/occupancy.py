@@ -66,5 +66,14 @@ def occupancy(clouds: Float[Tensor, "batch points columns"], side: int) -> Float
 def decode(
     occupied: Float[Tensor, "batch cells"], side: int, normalised: NormalisedClouds
 ) -> Float[Tensor, "batch points 3"]:
-    """Return the centres of the occupied cells in the clouds' own units, padded with rows of NaN (`chosen_centres`)."""
+    """Return the centres of the occupied cells in the clouds' own units, padded with rows of NaN.
+
+    Args:
+        occupied: occupancy of the cells, as `occupancy` returns it.
+        side: number of cells along each edge.
+        normalised: the encoded clouds, whose centre and scale convert the centres to the clouds' units.
+
+    Raises:
+        DataError: no cell of a cloud is occupied.
+    """
     return chosen_centres(occupied > 0, occupied, side, normalised, "occupied")

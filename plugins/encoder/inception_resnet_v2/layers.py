@@ -131,7 +131,7 @@ def mixed_7a() -> Branches:
 
 
 def block8(*, scale: float = 0.20, relu: bool = True) -> Residual:
-    """Return a residual block for 2080 channels."""
+    """Return a residual block for 2080 channels; `scale` and `relu` are those of `Residual`."""
     return Residual(
         2080,
         448,

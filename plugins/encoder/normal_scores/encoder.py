@@ -69,7 +69,14 @@ class NormalScores(Encoder, FitsInputs):
 
 
 def fit_scores(column: Float[Tensor, "sample"]) -> tuple[Float[Tensor, "knot"], Float[Tensor, "knot"]]:
-    """Return up to KNOTS ascending values of a number, and their standardised scores; a constant has the score 0."""
+    """Return the knots between which the scores of one input number are interpolated.
+
+    Args:
+        column: values of the number in the training samples.
+
+    Returns:
+        Up to KNOTS ascending values, and their standardised scores; the score is 0 if all values are equal.
+    """
     values, where, counts = torch.unique(column, return_inverse=True, return_counts=True)
     if len(values) == 1:
         return values, torch.zeros_like(values)

@@ -118,7 +118,12 @@ class DeepSets(CloudNetwork):
 def below_largest(
     values: Float[Tensor, "point channels"], counts: Int[Tensor, "batch"]
 ) -> Float[Tensor, "point channels"]:
-    """Return the values of each point minus the maximum of each channel over the points of its cloud."""
+    """Return the values of each point minus the maximum of each channel over the points of its cloud.
+
+    Args:
+        values: values of the concatenated points of all clouds.
+        counts: number of points of each cloud.
+    """
     if torch.compiler.is_exporting():  # all clouds of a trace have equally many rows
         return (values.unflatten(0, (counts.shape[0], -1)) - largest(values, counts)[:, None]).flatten(0, 1)
     return values - repeat_for_points(largest(values, counts), counts)

@@ -124,7 +124,12 @@ def concatenate_points(
 def largest(
     values: Float[Tensor, "point channels"], counts: Int[Tensor, "batch"]
 ) -> Float[Tensor, "batch channels"]:
-    """Return the maximum of each channel over the points of each cloud; every cloud has at least one point."""
+    """Return the maximum of each channel over the points of each cloud.
+
+    Args:
+        values: values of the concatenated points of all clouds.
+        counts: number of points of each cloud, at least 1.
+    """
     count, channels = counts.shape[0], values.shape[1]
     if torch.compiler.is_exporting():
         return values.unflatten(0, (count, -1)).amax(1)
@@ -136,7 +141,10 @@ def largest(
 
 
 def first_rows(counts: Int[Tensor, "batch"], most: int) -> Int[Tensor, "found"]:
-    """Return the rows, in the concatenated points of all clouds, of the first `most` points of each cloud."""
+    """Return the rows, in the concatenated points of all clouds, of the first `most` points of each cloud.
+
+    `counts` are the numbers of points of the clouds.
+    """
     if len(counts) == 0:
         return counts
     start = counts.cumsum(0) - counts
@@ -147,12 +155,15 @@ def first_rows(counts: Int[Tensor, "batch"], most: int) -> Int[Tensor, "found"]:
 def repeat_for_points(
     values: Float[Tensor, "batch channels"], counts: Int[Tensor, "batch"]
 ) -> Float[Tensor, "point channels"]:
-    """Return the values of each cloud, repeated for each of its points."""
+    """Return the values of each cloud, repeated for each of its points, in the order of the concatenated points.
+
+    `counts` are the numbers of points of the clouds.
+    """
     return values.repeat_interleave(counts, 0)
 
 
 def all_have(counts: Int[Tensor, "batch"], points: int) -> bool:
-    """Return whether every cloud has `points` points."""
+    """Return whether every cloud has `points` points; `counts` are the numbers of points of the clouds."""
     return bool((counts == points).all())
 
 

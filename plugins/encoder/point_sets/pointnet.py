@@ -105,7 +105,12 @@ class Matrix(nn.Module):
     def forward(
         self, values: Float[Tensor, "point size"], counts: Int[Tensor, "batch"]
     ) -> Float[Tensor, "batch size size"]:
-        """Return the matrix of each cloud from its points."""
+        """Return the matrix of each cloud.
+
+        Args:
+            values: concatenated points of all clouds.
+            counts: number of points of each cloud.
+        """
         entries = self.entries(self.whole(largest_after(self.each, values, counts)))
         return entries.unflatten(1, (self.size, self.size))
 
@@ -115,7 +120,13 @@ def multiply_by_matrices(
     matrices: Float[Tensor, "batch size size"],
     counts: Int[Tensor, "batch"],
 ) -> Float[Tensor, "point size"]:
-    """Return every point times the matrix of its cloud."""
+    """Return every point times the matrix of its cloud.
+
+    Args:
+        values: concatenated points of all clouds.
+        matrices: matrix of each cloud.
+        counts: number of points of each cloud.
+    """
     if torch.compiler.is_exporting():
         return (values.unflatten(0, (counts.shape[0], -1)) @ matrices).flatten(0, 1)
     parts = zip(values.split(counts.tolist()), matrices, strict=True)

@@ -210,7 +210,12 @@ def describe_balls(
 def order_by_distance(
     values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
 ) -> Float[Tensor, "point columns"]:
-    """Return the points of each cloud, ordered so that each is as far as possible from the points before it."""
+    """Return the points of each cloud, ordered so that each is as far as possible from the points before it.
+
+    Args:
+        values: concatenated points of all clouds; the first three columns are the positions.
+        counts: number of points of each cloud.
+    """
     if len(counts) == 0:
         return values
     positions = pad(values[:, :3].detach().split(counts.tolist()))

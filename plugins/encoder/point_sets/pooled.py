@@ -109,7 +109,16 @@ def rows_of_maxima(
     weight: Float[Tensor, "channels columns"],
     counts: Int[Tensor, "batch"],
 ) -> Int[Tensor, "batch channels"]:
-    """Return for each cloud and channel the row of the point with the largest product with the channel's weights."""
+    """Return for each cloud and channel the point for which the output of a linear layer is largest.
+
+    Args:
+        values: concatenated points of all clouds, the inputs of the layer.
+        weight: weight of the layer, which has no bias.
+        counts: number of points of each cloud.
+
+    Returns:
+        Rows of `values`.
+    """
     start = (counts.cumsum(0) - counts).tolist()
     parts = values.split(counts.tolist())  # one cloud at a time, so that its numbers stay in a CPU's cache
     # transposed, so that the numbers of a channel are contiguous

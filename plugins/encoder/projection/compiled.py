@@ -74,7 +74,16 @@ def project(cloud, focal, middle, nearest, farthest, depth, index, image):
 @compiled
 @no_type_check
 def halve(depth, index, coarse_depth, coarse_index):
-    """Fill depth and index of an image of half the size; each pixel shows the nearest point of its four pixels."""
+    """Fill depth and index of an image of half the size.
+
+    Each pixel shows the nearest of the points that the four pixels at its place show.
+
+    Args:
+        depth: see the module.
+        index: see the module.
+        coarse_depth: filled with the depths of the image of half the size.
+        coarse_index: filled with the indices of the image of half the size.
+    """
     coarse_depth[:] = np.inf
     coarse_index[:] = -1
     for row in range(depth.shape[0]):

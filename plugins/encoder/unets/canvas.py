@@ -63,7 +63,8 @@ class CropReport:
 Maps = Callable[[Tensor, Iterator[Step]], Tensor]
 """Function of images and layers that returns the maps that the last convolution reads.
 
-The images are differences from the empty background, and their sides are multiples of the stride.
+The images are differences from the empty background, and their sides are multiples of the stride. The layers are an
+iterator over functions, one for each layer of the network; the function takes one after the other.
 """
 
 
@@ -210,7 +211,7 @@ class CroppedUNet(Encoder):
 
     @abstractmethod
     def maps(self, images: Tensor, layers: Iterator[Step]) -> Tensor:
-        """Return the maps that the last convolution reads (see `Maps`)."""
+        """Return the maps that the last convolution reads; the arguments are described at `Maps`."""
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch outputs height width"]:
         """Return colours and scales of the images."""

@@ -71,7 +71,7 @@ class Slim(CroppedUNet):
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     def maps(self, images: Tensor, layers: Iterator[Step]) -> Tensor:
-        """Return the maps that the last convolution reads."""
+        """Return the maps that the last convolution reads; the arguments are described at `canvas.Maps`."""
         maps = next(layers)(unshuffle_pixels(images, self.unshuffle))
         across = [maps]
         for _ in range(self.levels - 1):

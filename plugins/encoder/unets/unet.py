@@ -76,7 +76,7 @@ class UNet(CroppedUNet):
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     def maps(self, images: Tensor, layers: Iterator[Step]) -> Tensor:
-        """Return the maps that the last convolution reads."""
+        """Return the maps that the last convolution reads; the arguments are described at `canvas.Maps`."""
         maps = images.contiguous(memory_format=torch.channels_last)
         across: list[Tensor] = []
         for level in range(self.levels):

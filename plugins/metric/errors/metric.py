@@ -99,6 +99,10 @@ class RootMeanSquareError(Errors):
 
 
 def names(metric: str, target: Target) -> list[str]:
-    """Return the names of the results: over all numbers, and then of each number if there are 2 to `FIRST` numbers."""
+    """Return the names of the results of a metric.
+
+    The first one is `metric`, the result over all numbers of the target. If the target has 2 to `FIRST` numbers, the
+    names of the results for the single numbers follow.
+    """
     several = target.names if 1 < len(target.names) <= FIRST else ()
     return [metric, *(f"{metric}_{name}" for name in several)]

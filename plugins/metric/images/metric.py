@@ -21,7 +21,7 @@ def encode_colors(light: Float[Tensor, "height width number"], encoding: Encodin
 
 
 def require_side(image: Tensor, least: int, remedy: str) -> None:
-    """Check that an image is large enough for the windows of SSIM.
+    """Check that an image is large enough for the windows of SSIM; `remedy` is the last sentence of the message.
 
     Raises:
         DataError: the shorter side has fewer than `least` pixels.

@@ -150,6 +150,12 @@ class PerImage(Metric, HasFigure):
 def check_images(channel: str, predicted: Tensor, true: Tensor, by: str) -> None:
     """Check that predicted and true images can be compared.
 
+    Args:
+        channel: channel of the images, "color", "mask" or "depth".
+        predicted: the predicted images of a batch.
+        true: the true images.
+        by: name of the metric, for messages.
+
     Raises:
         DataError: shapes or number types do not fit, or the images contain NaN or infinite numbers (+inf is allowed for
             depths).

@@ -34,7 +34,7 @@ def draw_descents(samples: Mapping[str, FittedImage], title: str, *, synthetic: 
 
 
 def draw_error_curves(axis: Axes, path: Float[Tensor, "step 4"]) -> None:
-    """Plot the errors in degrees and centimetres after each step."""
+    """Plot the errors in degrees and centimetres after each step; `path` is that of a `FittedImage`."""
     for column, (name, colour, near) in enumerate(
         (("rotation, degrees", COLOURS[0], 2.0), ("translation, cm", COLOURS[1], 1.0)), start=2
     ):

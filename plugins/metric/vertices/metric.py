@@ -143,7 +143,10 @@ def fields(prediction: Prediction, name: str, meanings: Mapping[str, str]) -> li
 def distances(
     point: Float[Tensor, "batch number"], target: Float[Tensor, "batch number"], scale: Float[Tensor, "batch"]
 ) -> Float[Tensor, "batch vertex"]:
-    """Return the distance of each predicted vertex from the true one, centimetres, float64."""
+    """Return the distance of each predicted vertex from the true one, centimetres, float64.
+
+    `scale` holds the metres per unit of the target, for each sample.
+    """
     gap = (point.double() - target.double()).unflatten(1, (-1, 3))
     return 100 * scale.double()[:, None] * torch.linalg.vector_norm(gap, dim=-1)
 

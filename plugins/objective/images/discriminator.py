@@ -68,7 +68,7 @@ class Discriminators(nn.Module):
 
 
 def build_discriminators(scales: int, width: int, layers: int, seed: int) -> Discriminators:
-    """Return discriminators whose initial weights are a function of the seed."""
+    """Return `Discriminators` with the given arguments, whose initial weights depend only on `seed`."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return Discriminators(scales, width, layers)

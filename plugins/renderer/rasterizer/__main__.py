@@ -63,7 +63,14 @@ class Parser(argparse.ArgumentParser):
 def number_parser(
     low: float | int, high: float | int, unit: str, *, kind: type = float
 ) -> Callable[[str], float | int]:
-    """Return a function that parses a number and checks that it lies between `low` and `high`."""
+    """Return a function that parses a number and checks that it lies between `low` and `high`.
+
+    Args:
+        low: smallest allowed number.
+        high: largest allowed number.
+        unit: text that follows the range in the error message, such as " metres".
+        kind: int for whole numbers, float for any numbers.
+    """
 
     def parse(text: str) -> float | int:
         try:

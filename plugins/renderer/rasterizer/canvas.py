@@ -150,7 +150,13 @@ class Canvas:
         self._pose, self._shown_mesh = np.empty(0), None
 
     def shows(self, corners: Corners, cull: bool, size: tuple[int, int]) -> bool:
-        """Return whether `depth` and `face` show this mesh, in the pose of the last call of `update_pose`."""
+        """Return whether `depth` and `face` show this mesh, in the pose of the last call of `update_pose`.
+
+        Args:
+            corners: Faces of the mesh.
+            cull: Whether faces seen from behind are left out.
+            size: Height and width of the image.
+        """
         return self.depth.shape == size and self._shown_mesh == (corners, cull)
 
     def clear(self, size: tuple[int, int]) -> None:
@@ -180,7 +186,10 @@ class Canvas:
         return self.tiles
 
     def record_mesh(self, corners: Corners, cull: bool, box: Box, counts: np.ndarray) -> None:
-        """Record the mesh that `depth` and `face` show, the box of its pixels, and the counts of its faces."""
+        """Record the mesh that `depth` and `face` show, the box of its pixels, and the counts of its faces.
+
+        `corners` and `cull` are as in `shows`.
+        """
         self._shown_mesh, self.box, self.counts = (corners, cull), box, counts
 
 

@@ -117,6 +117,12 @@ def check_scene(
 ) -> CheckedScene:
     """Check that these channels of a scene can be drawn, and return the checked scene.
 
+    Args:
+        scene: the scene.
+        channels: names of the channels.
+        mesh_cache: cache of face indices.
+        gradient: kind of gradient, see `Rasterizer`.
+
     Raises:
         ValueError: the scene cannot be drawn.
     """

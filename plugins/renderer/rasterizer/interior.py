@@ -289,7 +289,16 @@ def add_texture_gradient(faces, colors, texture, face_weights, pixel, grad_color
 @compiled
 @no_type_check
 def transform_to_world(vertices, rotation, grad_points, grad_vertices, grad_rotation, grad_translation):
-    """Convert gradients with respect to camera coordinates x = R X + t into gradients with respect to X, R and t."""
+    """Convert gradients with respect to camera coordinates x = R X + t into gradients with respect to X, R and t.
+
+    Args:
+        vertices: X.
+        rotation: R.
+        grad_points: gradient with respect to x.
+        grad_vertices: filled with the gradient with respect to X where it is not 0.
+        grad_rotation: the gradient with respect to R is added.
+        grad_translation: the gradient with respect to t is added.
+    """
     for vertex in range(vertices.shape[0]):
         x, y, z = grad_points[vertex, 0], grad_points[vertex, 1], grad_points[vertex, 2]
         if x == 0 and y == 0 and z == 0:

@@ -67,7 +67,8 @@ def is_out_of_view(vertices, rotation, translation, focal, principal, near, heig
     """Return whether the bounding box of all vertices lies completely outside one plane of the view frustum.
 
     The planes lie one pixel outside of the image, so that rounding loses no visible pixel. Coordinates that are NaN are
-    ignored. An infinite coordinate makes the box infinite and the result False.
+    ignored. An infinite coordinate makes the box infinite and the result False. `vertices` are in world coordinates;
+    the module describes the arguments of the camera.
     """
     low = np.full(3, np.inf)
     high = np.full(3, -np.inf)
@@ -108,7 +109,7 @@ def is_out_of_view(vertices, rotation, translation, focal, principal, near, heig
 def project(vertices, rotation, translation, focal, principal, near, camera_points, screen):
     """Fill `camera_points` and `screen` from the world coordinates `vertices`, (vertices, 3), metres.
 
-    Return the number of finite vertices that the near plane cuts off.
+    Return the number of finite vertices that the near plane cuts off. The module describes the other arguments.
     """
     hidden = 0
     for vertex in range(vertices.shape[0]):
@@ -158,7 +159,7 @@ def owns_edge(along_column, along_row):
 @compiled
 @no_type_check
 def comes_before(x, y, other_x, other_y):
-    """Return whether a point precedes another point in row-major order."""
+    """Return whether the point (x, y) precedes the point (other_x, other_y) in row-major order."""
     return y < other_y or (y == other_y and x < other_x)
 
 
@@ -347,7 +348,8 @@ def front_to_back(screen, faces, cull, height, width, depth, face, farthest, emp
     """Draw faces like `rasterise`, from near to far, and return the box of pixels that may show a face.
 
     `RUN` consecutive faces form a run. The runs are sorted by their nearest depth. If the box around a run is
-    completely hidden, the run is not drawn, and all its faces are counted as hidden.
+    completely hidden, the run is not drawn, and all its faces are counted as hidden. The arguments are those of
+    `rasterise`.
     """
     runs = (faces.shape[0] + RUN - 1) // RUN
     last_x, last_y = (width - 1) * SUBPIXELS, (height - 1) * SUBPIXELS

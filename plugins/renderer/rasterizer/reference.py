@@ -86,6 +86,14 @@ def find_visible_faces(
     """Return the index of the visible face at each pixel, (height, width); -1 for background.
 
     Corners are rounded to 1/256 pixel, and depths are compared in float32, as in the compiled kernels.
+
+    Args:
+        camera_points: (vertices, 3), vertices in camera coordinates.
+        faces: (faces, 3), indices of vertices.
+        lens: fx, fy, cx, cy, pixels.
+        near: distance of the near plane, metres.
+        size: height and width of the image, pixels.
+        cull: leave out faces seen from behind.
     """
     height, width = size
     screen = ((lens[:2] * camera_points[:, :2] / camera_points[:, 2:] + lens[2:]) * SUBPIXELS).round()

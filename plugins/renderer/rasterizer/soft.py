@@ -59,7 +59,10 @@ class SoftImage:
 
 
 def blur_margin(sigma: float, size: tuple[int, int]) -> float:
-    """Return the largest distance from a face, in pixels, at which a pixel outside of the face still shows it."""
+    """Return the largest distance from a face, in pixels, at which a pixel outside of the face still shows it.
+
+    `sigma` is σ of the module's docstring, and `size` the (height, width) of the image in pixels.
+    """
     return math.sqrt(REACH * sigma) * min(size) / 2
 
 
@@ -75,7 +78,20 @@ def render(
     gamma: float,
     counts: np.ndarray,
 ) -> SoftImage:
-    """Return the soft image of the vertices from `raster.project`; `counts` is as in `raster.rasterise`."""
+    """Return the soft image of the vertices from `raster.project`.
+
+    Args:
+        camera_points: see `raster`.
+        screen: see `raster`.
+        faces: (faces, 3), indices of vertices.
+        colors: (vertices, channels).
+        lens: fx, fy, cx, cy, pixels.
+        cull: leave out faces seen from behind.
+        size: height and width of the image, pixels.
+        sigma: σ of the module's docstring.
+        gamma: γ of the module's docstring.
+        counts: the number of faces with each outcome is added, as in `raster.rasterise`.
+    """
     positions, bounds = np.zeros((len(camera_points), 2)), np.zeros((len(faces), 4), np.int64)
     margin = blur_margin(sigma, size)
     nearest = prepare(camera_points, screen, faces, lens, cull, *size, margin, positions, bounds, counts)
@@ -103,7 +119,7 @@ def add_gradients(
 ) -> None:
     """Add the gradients of a loss to `grad_points`, `grad_colors` and `grad_lens`.
 
-    `grad_image` is the gradient of the loss with respect to the image.
+    `grad_image` is the gradient of the loss with respect to the image, and `blend_data` the result of `render`.
     """
     if blend_data.nearest >= 0:
         arrays = (blend_data.positions, blend_data.bounds, blend_data.nearest, *blend_data.scales)
@@ -119,7 +135,7 @@ def prepare(camera_points, screen, faces, lens, cull, height, width, margin, pos
     """Fill `positions` and `bounds` of `SoftImage`, and return the index of the nearest vertex in view, or -1.
 
     The number of faces with each outcome is added to `counts`, as in `raster.rasterise`. -1 means that no face is in
-    view. `margin` is the result of `blur_margin`.
+    view. `margin` is the result of `blur_margin`. With `cull`, faces seen from behind are left out.
     """
     for vertex in range(camera_points.shape[0]):
         if screen[vertex, 2] != 0:
@@ -165,7 +181,10 @@ def prepare(camera_points, screen, faces, lens, cull, height, width, margin, pos
 @compiled
 @no_type_check
 def face_corners(positions, a, b, c):
-    """Return column and row of the three corners of a face, pixels."""
+    """Return column and row, pixels, of the three corners of a face.
+
+    `positions` is that of `SoftImage`; `a`, `b` and `c` are the indices of the face's vertices.
+    """
     return (
         positions[a, 0],
         positions[a, 1],
@@ -179,7 +198,7 @@ def face_corners(positions, a, b, c):
 @compiled
 @no_type_check
 def screen_weights(ax, ay, bx, by, cx, cy, x, y):
-    """Return barycentric weights of the point (x, y) on the screen; their sum is 1."""
+    """Return barycentric weights of the point (x, y) in the triangle (ax, ay), (bx, by), (cx, cy) on the screen."""
     inverse = 1.0 / ((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
     return (
         ((bx - x) * (cy - y) - (cx - x) * (by - y)) * inverse,
@@ -191,7 +210,10 @@ def screen_weights(ax, ay, bx, by, cx, cy, x, y):
 @compiled
 @no_type_check
 def triangle_heights(ax, ay, bx, by, cx, cy):
-    """Return the three heights of a triangle, pixels; the i-th runs from corner i to the opposite edge."""
+    """Return the three heights of the triangle (ax, ay), (bx, by), (cx, cy), pixels.
+
+    Height i is the distance of corner i from the line through the opposite edge.
+    """
     area = abs((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
     return (
         area / np.hypot(cx - bx, cy - by),
@@ -293,6 +315,8 @@ def forward(
     """Fill the arrays `most`, `total`, `clear`, `mean` and `color` of `SoftImage`, face by face.
 
     The sums `total` and `mean` are relative to exp(most / γ); they are rescaled whenever a face increases `most`.
+    `positions`, `bounds` and `nearest` are those of `SoftImage`; `sharpness`, `gamma` and `margin` are the three
+    numbers of its `scales`.
     """
     channels = colors.shape[1]
     height, width = most.shape

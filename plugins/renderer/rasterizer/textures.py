@@ -40,7 +40,7 @@ class TextureArrays(NamedTuple):
 @compiled
 @no_type_check
 def interpolate_uv(texture, index, w0, w1, w2):
-    """Return the texture coordinates (u, v) of a face at barycentric weights."""
+    """Return the texture coordinates (u, v) of face `index` at the barycentric weights w0, w1, w2."""
     a, b, c = texture.corners[index, 0], texture.corners[index, 1], texture.corners[index, 2]
     uv = texture.uv
     return (
@@ -106,7 +106,7 @@ def interpolate(texture, texels_around, channel):
 @compiled
 @no_type_check
 def interpolation_derivatives(texture, image, texels_around, channel):
-    """Return the derivatives of `interpolate` with respect to u and v."""
+    """Return the derivatives of `interpolate` with respect to u and v; `image` is the index of the texture's image."""
     a, b, c, d, right, down = texels_around
     texels = texture.texels
     above = texels[b, channel] - texels[a, channel]

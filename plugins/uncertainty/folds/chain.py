@@ -100,7 +100,7 @@ class Chain(nn.Module):
 
 @torch.no_grad()
 def build_chain(networks: Sequence[nn.Module], dropout: Sequence[float | None]) -> Chain | None:
-    """Return the networks as a `Chain`.
+    """Return the networks as a `Chain`, whose arguments are `networks` and `dropout`.
 
     The result is None if a network has layers that `Chain` cannot compute. It is also None if the outputs of a network
     differ from those of the chain, because the network's `forward` does more than apply its layers.

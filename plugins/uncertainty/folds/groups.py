@@ -199,7 +199,8 @@ def _select(batches: Sequence[Batch], masks: Sequence[Bool[Tensor, "sample"]]) -
 def build_models(models: Sequence[Predictor], dropout: Sequence[float | None]) -> Together | Apart:
     """Return the models as `Together` if their layers can be stacked, and as `Apart` otherwise.
 
-    The layers can be stacked if `build_chain` accepts them and the density head has no trained parameters.
+    The layers can be stacked if `build_chain` accepts them and the density head has no trained parameters. `dropout` is
+    the probability of all dropout layers, for each group; None leaves them as they are.
     """
     first = models[0]
     if not isinstance(first, Model) or isinstance(first.head, Fitted) or first.head.direct:

@@ -28,11 +28,11 @@ class Schedule:
     """Length and step sizes of a training.
 
     Attributes:
-        steps, epochs: the training takes at least so many steps, and so many passes over the samples.
+        steps, epochs: smallest number of steps, and smallest number of passes over the samples.
         learning_rate: largest learning rate of AdamW.
         weight_decay: decay of the weights in each group; biases do not decay.
         batch_size: samples of a batch of each model.
-        most_steps: the training takes at most so many steps.
+        most_steps: largest number of steps, even if `steps` and `epochs` ask for more.
     """
 
     steps: int

@@ -54,7 +54,8 @@ class Folds(Uncertainty, SelfTraining):
         dropout: probability of all dropout layers in each group; null keeps the probabilities of the encoder.
         weight_decay: weight decay in each group.
         learning_rate: largest learning rate.
-        steps, epochs: each group trains for at least so many steps and passes over its samples.
+        steps, epochs: smallest number of steps, and smallest number of passes over its samples, for which each group
+            trains.
 
     Attributes:
         log_weights: logarithms of the weights of the groups, a float64 buffer.
@@ -143,7 +144,21 @@ class Folds(Uncertainty, SelfTraining):
         batch_size: int,
         most_steps: int | None = None,
     ) -> float:
-        """Train and calibrate all models; return the mean loss of samples by models that did not see them, nats."""
+        """Train and calibrate all models.
+
+        Args:
+            inputs: inputs of all samples.
+            target: targets of all samples.
+            seed: seed of the folds and of the training.
+            batch_size: number of samples of a batch of each model.
+            most_steps: largest number of steps; None for MOST_STEPS.
+
+        Returns:
+            Mean loss of the samples, each predicted by models that did not see it, nats.
+
+        Raises:
+            ConfigError: there are fewer than two samples per fold.
+        """
         if len(inputs) < 2 * self.folds:
             raise ConfigError(
                 f"uncertainty.folds.folds = {self.folds} needs at least {2 * self.folds} samples for training and "

@@ -89,8 +89,13 @@ def log_probs_and_scores(
 ) -> tuple[Float[Tensor, "target batch"], Float[Tensor, "batch target raw"]]:
     """Return log p(y | raw), and the scores ∇ log p(y | raw), float64, for several targets y of each sample.
 
-    One derivative of densities of batch_shape (target, batch) gives all scores. If `density_of` returns densities of
-    another shape, or another score for the first targets, then each target has a derivative of its own.
+    All targets are evaluated in one pass if `density_of` accepts raw parameters of shape (target, batch, raw). If it
+    does not, or if its results for the first target then differ, each target is evaluated in a pass of its own.
+
+    Args:
+        density_of: function from raw parameters to densities of batch_shape (batch,).
+        raw: raw parameters.
+        targets: targets y.
     """
     leaf = raw.detach().clone().requires_grad_()
     density = density_of(leaf)

@@ -95,6 +95,11 @@ def fit(
     """Return the slope and the biases with the smallest mean cross-entropy to the (smoothed) labels (eq. 2.19).
 
     The problem is convex.
+
+    Args:
+        log_prob: log-probabilities of the classes, nats, float64.
+        label: true class of each sample.
+        smoothing: whether the labels are smoothed, as in `Platt`.
     """
     classes = log_prob.shape[-1]
     wanted = targets(label, classes, smoothing=smoothing)

@@ -82,6 +82,12 @@ def fit(predicted: Sequence[Distribution], batches: Sequence[Batch], lower: floa
     If no temperature is better than 1, the result is 1. The negative log-likelihood of a target y is -log p(y)^(1/T) +
     log Z with the normalising constant Z of p^(1/T) (eq. 2.19). Targets of probability 0 have probability 0 at any T:
     they are left out, and their number is logged.
+
+    Args:
+        predicted: densities of each batch.
+        batches: batches, whose targets are read.
+        lower: lower bound of T.
+        upper: upper bound of T.
     """
     targets = [batch["target"] for batch in batches]
     with torch.no_grad():
