@@ -237,7 +237,7 @@ def add_label_noise(
 
 
 def find_runs(part: Part, label: str) -> list[Path]:
-    """Return the run folders of a row.
+    """Return the run folders of the row with the label `label` in a section.
 
     Raises:
         DataError: No run matches the row.

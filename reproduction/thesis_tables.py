@@ -300,7 +300,7 @@ def report(page: str, written: Mapping[str, float]) -> str:
 
     Args:
         page: Text of the page before.
-        written: Minutes that the pages of a table took; the page keeps the minutes of the other tables.
+        written: Minutes that the pages took, by the number of their table; the page keeps the minutes of other tables.
     """
     before = {line.split(" | ")[0].removeprefix("| "): line for line in page.splitlines()}
     lines, counted = [], set[str]()

@@ -16,7 +16,7 @@ NARROWEST = 1e-12
 
 @dataclass(frozen=True)
 class Choice:
-    """Domain of a key that is a list of equally likely values, in the notation of overrides."""
+    """Domain of a key that is a list of equally likely values; `options` holds them in the notation of overrides."""
 
     options: Sequence[object]
 

@@ -1,4 +1,4 @@
-"""Time registration on one core, measure the rank that it needs, and make Table 6.4.
+"""Time mesh registration on one core, measure the smallest error for each rank of the network, and make Table 6.4.
 
     python -m reproduction.thesis_tables 6.4
     python -m reproduction.chapter6.registration [<run of registration/quick> [<run of faust/registration>]] \\

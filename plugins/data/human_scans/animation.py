@@ -42,7 +42,12 @@ class Moment(NamedTuple):
 
 @dataclass(frozen=True)
 class Actor:
-    """Person who is drawn repeatedly: triangles, and the linear RGB of each vertex."""
+    """Person who is drawn repeatedly; the positions of the vertices are those of a `Moment`.
+
+    Attributes:
+        faces: triangles, as indices of the vertices.
+        colors: linear RGB of each vertex.
+    """
 
     faces: Int[Tensor, "faces 3"]
     colors: Float[Tensor, "vertices 3"]
@@ -58,6 +63,12 @@ class Generated:
     The registered mesh comes from the data set and is brought into each pose; its distances from the bare body and its
     colours do not change. The scan is generated anew in each pose, with the same clothes, hair and light, and with the
     shading of the pose.
+
+    Args:
+        crowd: all people of the data set.
+        split: split of the person.
+        number: number of the person in the split.
+        name: name of the topology of the registered mesh.
 
     Attributes:
         stood: the pose that photographs of the data set show.

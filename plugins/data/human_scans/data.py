@@ -268,7 +268,12 @@ class HumanScans(Data, SubjectFolder, HasScenes):
 
 
 class Photographs(Dataset[Batch]):
-    """Photographs of one split, read when they are fetched, in the order of subjects and of each subject's views."""
+    """Photographs of one split, read when they are fetched, in the order of subjects and of each subject's views.
+
+    Args:
+        subjects: subjects of the split.
+        shows: kind of the target, as in `HumanScans`.
+    """
 
     def __init__(self, subjects: Sequence[Subject], shows: Shows) -> None:
         self.shows = shows

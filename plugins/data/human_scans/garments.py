@@ -60,7 +60,12 @@ class Skirt:
 
 
 class Outfit(NamedTuple):
-    """Garments from the innermost outwards, and a skirt or None."""
+    """Clothes of one person.
+
+    Attributes:
+        garments: garments from the innermost outwards, without a skirt.
+        skirt: the skirt; None if the person wears none.
+    """
 
     garments: list[Garment]
     skirt: Skirt | None

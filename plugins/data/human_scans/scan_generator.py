@@ -98,7 +98,10 @@ class Person(NamedTuple):
 
 
 class Crowd:
-    """All generated people of a data set; a person depends only on the settings, the seed, the split and a number."""
+    """All generated people of a data set; a person depends only on the settings, the seed, the split and a number.
+
+    The arguments are those of `scans_root`.
+    """
 
     def __init__(self, renderer: Renderer, counts: Mapping[str, int], drawing: Drawing, seed: int) -> None:
         self.renderer, self.counts, self.drawing, self.seed = renderer, dict(counts), drawing, seed

@@ -190,7 +190,14 @@ class PoseFromImage(Data):
 
 
 class Poses(FetchedInBatches):
-    """Images of the bodies of one split, which are rendered when they are fetched."""
+    """Images of the bodies of one split, which are rendered when they are fetched.
+
+    Args:
+        body_model: body that the images show.
+        renderer: renderer that draws the images.
+        camera: camera of all images.
+        numbers: parameters of the body in each image.
+    """
 
     def __init__(
         self,

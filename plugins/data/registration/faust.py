@@ -23,7 +23,13 @@ WANTED = (
 
 @dataclass(frozen=True)
 class Scan:
-    """Training scan with a number from 0 to 99, which shows the person number // 10 in the pose number % 10."""
+    """Training scan of FAUST.
+
+    Attributes:
+        number: number of the scan, 0 to 99; it shows the person number // 10 in the pose number % 10.
+        scan: path of the scan.
+        registration: path of the scan's registration.
+    """
 
     number: int
     scan: Path

@@ -37,7 +37,14 @@ class Scanner:
 
 @dataclass(frozen=True, kw_only=True)
 class Kinds:
-    """Shares of the scans with missing parts and with points of other objects; all other scans are complete."""
+    """Shares of two kinds of scans; the remaining scans are complete.
+
+    If the two shares add up to more than 1, both are divided by their sum.
+
+    Attributes:
+        partial: share of the scans with missing parts.
+        outliers: share of the scans with points of other objects.
+    """
 
     partial: Share = 0.2
     outliers: Share = 0.2

@@ -28,7 +28,12 @@ GROUPS = {"color": COLOR, "normal": NORMAL}
 
 
 class Basis(NamedTuple):
-    """Basis points, with the data structure that nearest-point searches of many clouds share."""
+    """Basis points, prepared for searches of their nearest points in many clouds.
+
+    Attributes:
+        points: the basis points.
+        queries: the same points in the data structure that the search reads.
+    """
 
     points: Float[Tensor, "k 3"]
     queries: Queries

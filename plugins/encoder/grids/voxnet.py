@@ -19,7 +19,7 @@ SLOPE = 0.1
 
 @dataclass(frozen=True)
 class Published:
-    """Published sizes of a variant's convolutions, fully connected layers and dropout layers."""
+    """Published settings of a variant of `VoxNet`; the attributes are the arguments of the same names."""
 
     channels: tuple[int, ...]
     widths: tuple[int, ...]

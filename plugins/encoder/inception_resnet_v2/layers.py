@@ -52,6 +52,10 @@ class Residual(nn.Module):
     """The scaled Inception-ResNet block ReLU(x + scale · conv(branches(x))) of Szegedy et al. 2017.
 
     Args:
+        planes: number of channels of x.
+        joined: number of channels of the concatenated outputs of the branches.
+        branches: the branches.
+        scale: factor of the block's output before it is added to x.
         relu: whether the sum is rectified; the last block of the network does not rectify its sum.
     """
 

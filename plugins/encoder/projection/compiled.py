@@ -109,7 +109,7 @@ def paint(cloud, index, level, nearest, farthest, image):
             `image`, in the same place; negative where no point is visible.
         level: base-2 logarithm of the side of a square.
         nearest: depth that becomes 0 in the fourth channel, metres.
-        farthest: depth that becomes 1 there, metres.
+        farthest: depth that becomes 1 in the fourth channel, metres.
         image: (4, height, width), written: red, green, blue and scaled depth.
     """
     span = farthest - nearest

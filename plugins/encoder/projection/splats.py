@@ -65,8 +65,8 @@ def compute_surface(
     do not belong to the subject these four channels are 1. The pixels of the subject are those that show a point, with
     the gaps between them filled by a morphological closing.
 
-    On the CPU the function is compiled unless a gradient is required. All implementations give the same bits. It is
-    differentiable in the channels of the images, but not in the set of visible points.
+    On the CPU the function is compiled unless a gradient is required. All implementations give the same bits. The
+    result is differentiable in the channels of the images, but not in the set of visible points.
 
     Args:
         images: images of `encoder.project` at one level, (batch, 4, height, width).

@@ -33,6 +33,8 @@ class Layer(nn.Module):
     """A convolution, normalisation and ReLU, applied to maps that are differences from the empty background.
 
     Args:
+        channels: number of channels of the input maps.
+        outputs: number of channels of the output maps.
         size: side of the kernel, pixels; 3 keeps the size of the image, 2 halves it.
         normalisation: "batch" normalises by the moments of the batch. "renorm" normalises by the moments of the batch,
             and then corrects the numbers towards those that the running moments give (Ioffe 2017). "group" normalises

@@ -64,6 +64,9 @@ class SceneArrays:
     """Inputs of an image that have a gradient, and the texture, as arrays.
 
     Attributes:
+        vertices: world coordinates, (vertices, 3), metres.
+        colors: linear RGB or other channels of each vertex, (vertices, channels); None without vertex colours.
+        rotation, translation: (3, 3) and (3,), from world to camera coordinates.
         lens: fx, fy, cx, cy, pixels.
         texture: the texture, with the texels of all its images.
     """

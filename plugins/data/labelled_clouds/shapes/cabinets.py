@@ -54,7 +54,10 @@ def case(width: Number, depth: Number, height: Number, board: Number, z: Number,
 
 
 def feet(random: Random, width: Number, depth: Number, foot: Number, thick: Number = 0.06) -> list[Solid]:
-    """Return the base of a cabinet of height `foot`: legs or a plinth, or nothing if `foot` is 0."""
+    """Return legs or a plinth of height `foot` for a cabinet of `width` × `depth`; nothing if `foot` is 0.
+
+    `thick` is the thickness of the legs.
+    """
     if not foot:
         return []
     if random.random() < 0.3:

@@ -24,7 +24,7 @@ def legs(random: Random, width: float, depth: float, height: float, thick: float
 
 
 def rails(random: Random, width: float, depth: float, height: float, thick: float) -> list[Solid]:
-    """Return bars between the legs; in most cases there are none."""
+    """Return bars between the legs that `legs` returns for the same arguments; in most cases there are none."""
     if random.random() > 0.35:
         return []
     z, half = height * random.uniform(0.2, 0.45), thick * 0.35
@@ -33,7 +33,16 @@ def rails(random: Random, width: float, depth: float, height: float, thick: floa
 
 
 def top(random: Random, width: float, depth: float, height: float, thick: float, bar: float) -> list[Solid]:
-    """Return the top of a table on four legs of thickness `bar`, sometimes with bars between the legs and an apron."""
+    """Return a table top on four legs, sometimes with bars between the legs and an apron.
+
+    Args:
+        random: Source of all random numbers.
+        width: Width of the top.
+        depth: Depth of the top.
+        height: Height of the legs.
+        thick: Thickness of the top.
+        bar: Thickness of the legs.
+    """
     parts = [
         box(width, depth, thick, (0, 0, height)),
         legs(random, width, depth, height, bar),
