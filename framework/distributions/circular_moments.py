@@ -14,11 +14,14 @@ from framework.distributions.protocol import trigonometric_moments
 POINTS = (720, 2880)
 """Number of angles on the coarse grid, and on the fine grid for densities that the coarse grid does not resolve."""
 MASS_GAP = 1e-4
-"""Largest difference between 1 and a density's integral over a grid at which the grid may resolve the density."""
-COARSE_ENOUGH = {torch.float64: 1e-8}
-"""Largest |m_n| at which the coarse grid resolves a density, by number type.
+"""Largest accepted difference between 1 and a density's integral over a grid.
 
-m_n are the moments of `CircularMoments`, and n are the highest orders that the grid gives.
+If the difference is larger, the grid does not resolve the density.
+"""
+COARSE_ENOUGH = {torch.float64: 1e-8}
+"""Largest |m_n|, for the highest orders n that the coarse grid gives, at which this grid resolves a density.
+
+The keys are number types. m_n are the moments of `CircularMoments`.
 """
 ROUNDED = 4e-6
 """Value of COARSE_ENOUGH for number types with fewer digits than float64.
@@ -26,7 +29,7 @@ ROUNDED = 4e-6
 In float32, rounding alone gives the moments of the highest orders a size of 2e-6, which no finer grid reduces.
 """
 LAST_MOMENTS = 1e-4
-"""Largest |m_n| at which the fine grid resolves a density; n are the highest orders that the grid gives.
+"""Largest |m_n|, for the highest orders n that the fine grid gives, at which this grid resolves a density.
 
 Moments of still higher orders are taken as 0. A von Mises density with concentration 3,500 (σ = 1°) does not need the
 fine grid, and one with 100,000 (σ = 0.18°) is still resolved on the fine grid.

@@ -37,7 +37,9 @@ A value that is an image has about 1e5 elements.
 """
 
 SHORT, MANY = 16, 4096
-"""Largest number of components, and smallest number of weights, for which weights are normalised by simple operations.
+"""Largest number of components, and smallest number of weights, for which torch's log_softmax is not used.
+
+Weights are then normalised by simpler operations, which take less time for many short rows of weights.
 """
 
 CROSSED = 16

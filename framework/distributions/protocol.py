@@ -38,7 +38,7 @@ from framework.errors import UserError
 def marginal(density: Distribution, index: int) -> Distribution:
     """Return the density of number `index` of the target alone, with an event dimension of one, (1,).
 
-    Default: a density of one number is its own marginal. Densities over several numbers register their own.
+    By default, a density of one number is its own marginal. A density over several numbers registers its own function.
 
     Raises:
         UserError: the density has not registered a marginal.
@@ -56,9 +56,10 @@ def marginal(density: Distribution, index: int) -> Distribution:
 def median(density: Distribution, samples: int) -> Tensor:
     """Return the point of least expected absolute deviation, number by number (thesis eq. 3.23), (*batch, *event).
 
-    Default: for classes the mode, since a label is either right or wrong; otherwise the median of `samples` draws
-    (thesis eq. 3.24), which for angles is the circular median. A density whose median is known in closed form registers
-    it and draws nothing. A mixture of several components over images returns its mean instead.
+    For classes, the default returns the mode, since a label is either right or wrong. For numbers, the default returns
+    the median of `samples` draws (thesis eq. 3.24), which for angles is the circular median. A density whose median is
+    known in closed form registers its own function, which draws nothing. For a mixture of several components over
+    images, the function returns the mean instead.
     """
     if density.has_enumerate_support:
         return density.mode
@@ -72,8 +73,8 @@ def median(density: Distribution, samples: int) -> Tensor:
 def pick(density: Distribution, index: Tensor) -> Distribution:
     """Return the density at `index` of the last batch dimension of a density with batch_shape (*batch, K).
 
-    `index` has the shape (*sample, *batch). Only `sample` of the returned density is used. Default: all K densities are
-    sampled, and all draws except those at `index` are discarded, which is right but slow. A density with parameters
+    `index` has the shape (*sample, *batch). Only `sample` of the returned density is used. By default, all K densities
+    are sampled, and all draws except those at `index` are discarded, which is right but slow. A density with parameters
     registers a function that reads the parameters at `index` (`take`).
     """
     return _Picked(density, index)
@@ -114,8 +115,8 @@ class _Picked(Distribution):
 def recentre(density: Distribution, index: tuple[Tensor, ...], origin: Tensor) -> Distribution:
     """Return the density of X - origin, in float64, so that values near the origin keep their digits.
 
-    X is a random number with the density at `index` of the batch. Only `log_prob` of the returned density is used.
-    Default: the origin is added to each value, and the sum is rounded to the density's number type. A density with a
+    X is a random number with the density at `index` of the batch. Only `log_prob` of the returned density is used. By
+    default, the origin is added to each value, and the sum is rounded to the density's number type. A density with a
     location registers a function that subtracts the origin from the location: then no rounding limits how narrow the
     density may be.
 
@@ -168,10 +169,11 @@ class _Recentred(Distribution):
 def tempered_density(density: Distribution, temperature: Tensor) -> Distribution:
     """Return the density proportional to p^(1/T) for a density p and a temperature T > 0, a scalar.
 
-    It has the same shapes and number type as p, and is differentiable in T. Call `tempering.temper` instead, which
-    refuses an invalid T. Default (registered in `tempering`): the probabilities of classes are raised to the power and
-    divided by their sum; the power of the density of one angle over the whole circle is normalised on a grid, which is
-    refined until it resolves the power.
+    The result has the same shapes and number type as p, and is differentiable in T. Callers use `tempering.temper`
+    instead, which refuses an invalid T and then calls this function. The default, registered in `tempering`, handles
+    two kinds of densities. The probabilities of classes are raised to the power and divided by their sum. The power of
+    the density of one angle over the whole circle is normalised on a grid, which is refined until it resolves the
+    power.
 
     Raises:
         UserError: any other density that has not registered its power, or a power too narrow for the finest grid.
@@ -217,9 +219,9 @@ def estimate_with_error(
 def estimate(density: Distribution, value: Tensor) -> Estimate:
     """Return the log-density at `value` (*sample, *batch, *event) with its Monte Carlo error, (*sample, *batch).
 
-    Default: log_prob with an error of NaN, "not known", since it is not known whether log_prob uses random draws. If
-    log_prob of a density uses none, the density registers `exact_estimate`. If it uses some, the density registers its
-    own function.
+    The default returns log_prob with an error of NaN ("not known"), since it is not known whether log_prob uses random
+    draws. A density whose log_prob uses no draws registers `exact_estimate`. A density whose log_prob uses draws
+    registers its own function.
     """
     result = exact_estimate(density, value)
     unknown = torch.full_like(result.log_mean, math.nan)
@@ -237,7 +239,8 @@ def exact_estimate(density: Distribution, value: Tensor) -> Estimate:
 def cdf(density: Distribution, value: Tensor) -> Tensor | None:
     """Return P(X ≤ y) of a density of one real number, float64 (*sample, *batch), at `value` y (*sample, *batch, 1).
 
-    Default: exact where `normals` knows the density as a mixture of normals, otherwise None, "not known".
+    The default is exact if `normals` knows the density as a mixture of normals. For other densities, it returns None
+    ("not known").
     """
     components = normals(density)
     if components is None:
@@ -254,8 +257,9 @@ def cdf(density: Distribution, value: Tensor) -> Tensor | None:
 def marginal_cdfs(density: Distribution, value: Tensor) -> Tensor | None:
     """Return P(X_i ≤ y_i) of each number i on its own; float64, in the shape of `value` y (*sample, *batch, *event).
 
-    Default: for a vector of real numbers, the `cdf` of each `marginal`, or None if one of them is not known; for an
-    image, None. A density over images registers its own function, since a hundred thousand marginals would be too many.
+    For a vector of real numbers, the default returns the `cdf` of each `marginal`, or None if one of these functions is
+    not known. For an image, it returns None. A density over images registers its own function, since a hundred thousand
+    marginals would be too many.
     """
     if len(density.event_shape) != 1:
         return None
@@ -270,7 +274,7 @@ def ranked_score(density: Distribution, value: Tensor) -> Tensor | None:
     """Return the continuous ranked probability score of a density of one real number at `value` y (*batch, 1).
 
     The score E|X - y| - ½ E|X - X'| (Gneiting & Raftery 2007, eq. 21) is float64, (*batch), in the unit of the number.
-    Default: None, no formula is known. The metric then uses its own formula or draws.
+    The default returns None, because no formula is known. The metric then uses its own formula or draws.
     """
     return None
 
@@ -280,8 +284,8 @@ def arc_probability(density: Distribution, start: Tensor, end: Tensor) -> Tensor
     """Return the probability of the arc from `start` counter-clockwise to `end` for one angle; None if unknown.
 
     Angles are (*sample, *batch, 1), radians; the probability is float64 (*sample, *batch). The arc is shorter than the
-    whole circle, and it is empty if `start` equals `end`. Default: None. Callers then use `circular_moments`, which
-    gives the probability unless the density is too narrow for its grid.
+    whole circle, and it is empty if `start` equals `end`. The default returns None. Callers then use
+    `circular_moments`, which gives the probability unless the density is too narrow for its grid.
     """
     return None
 
@@ -291,8 +295,8 @@ def trigonometric_moments(density: Distribution, count: int, weights: Tensor | N
     """Return the moments E exp(i n X) of one angle X, n = 0 … `count` - 1; None if they are not known.
 
     The moments are complex128, (count, *batch). With `weights` (*batch, float64) the result is their weighted sum over
-    the last dimension of the batch, so that a mixture of many components needs memory for one order only. Default:
-    None. Callers then use `circular_moments`, which computes the moments on a grid.
+    the last dimension of the batch, so that a mixture of many components needs memory for one order only. The default
+    returns None. Callers then use `circular_moments`, which computes the moments on a grid.
     """
     return None
 
@@ -366,7 +370,7 @@ def one_normal(mean: Tensor, scale: Tensor) -> Normals:
 def normals(density: Distribution) -> Normals | None:
     """Return the mixture of normals that a density of one real number, event_shape (1,), is equal to.
 
-    Default: None, it is not known to be a mixture of normals.
+    The default returns None, because the density is not known to be a mixture of normals.
     """
     return None
 
@@ -375,8 +379,8 @@ def normals(density: Distribution) -> Normals | None:
 def mahalanobis(density: Distribution, value: Tensor) -> Tensor | None:
     """Return (y - μ)ᵀ Σ⁻¹ (y - μ) at `value` y for a normal density with mean μ and covariance Σ.
 
-    The density may be over any number of real numbers. The squared distance is float64, (*sample, *batch). Default:
-    None, the density is not known to be normal.
+    The density may be over any number of real numbers. The squared distance is float64, (*sample, *batch). The default
+    returns None, because the density is not known to be normal.
     """
     return None
 
@@ -385,8 +389,8 @@ def mahalanobis(density: Distribution, value: Tensor) -> Tensor | None:
 def mode_candidates(density: Distribution) -> Tensor:
     """Return candidates for the mode, (peak, *batch, *event): values where the density may be highest.
 
-    It is not checked that the density is highest at one of them. Default: the mode alone. A density with several peaks
-    registers a candidate for each.
+    The density need not be highest at one of the candidates. The default returns the mode alone. A density with several
+    peaks registers a function that returns a candidate for each peak.
     """
     return density.mode.unsqueeze(0)
 
@@ -395,7 +399,8 @@ def mode_candidates(density: Distribution) -> Tensor:
 def peak_widths(density: Distribution) -> Tensor:
     """Return the width of the peak at each of the `mode_candidates` of a density of one number, (peak, *batch).
 
-    The unit is that of the number. Default: the standard deviation of a normal density that is as high at its mode.
+    The unit is that of the number. The default returns the standard deviation of a normal density that is as high at
+    its mode as the density is at the candidate.
     """
     candidates = mode_candidates(density)
     return (-density.log_prob(candidates).double()).exp() / math.sqrt(2 * math.pi)
@@ -422,7 +427,7 @@ def quadratic_bound(density: Distribution, value: Tensor) -> QuadraticBound | No
     Let g be the `pull` and h the `stiffness` of the bound, h > 0. For real numbers, log p(y + d) ≥ log p(y) + Σ (g d -
     h d²/2) for all d. For angles, log p(y + d) ≥ log p(y) + Σ (g sin d - h (1 - cos d)) for all d. In a mixture, g and
     h are means over the components, weighted by each component's share of p(y) (Jensen). So a step to the maximum of
-    the bound never lowers p (Dempster, Laird & Rubin 1977). Default: None, no bound is known.
+    the bound never lowers p (Dempster, Laird & Rubin 1977). The default returns None, because no bound is known.
     """
     return None
 
@@ -434,7 +439,7 @@ def images(density: Distribution, channels: Collection[str]) -> dict[str, Tensor
     Each image is (*batch, height, width) or (*batch, height, width, number), as `framework.renderer.Renderer.channels`
     says: "color" is linear RGB. For torch's own densities over images, event_shape (height, width, number), "color" is
     the mean, taken as linear RGB. If a density is over pixel values as they are stored in files (a target of kind
-    "image"), it registers its own function. Default: the density has no images, and an error is raised.
+    "image"), it registers its own function. By default, a density has no images, and an error is raised.
 
     Raises:
         UserError: no images are registered for the density, or one of the channels is not among them.
@@ -476,7 +481,7 @@ class ValueSet(ABC):
 
         The batch is flattened. For classes, the parts are labels. For one real number, they are intervals (low, high).
         For one angle, they are arcs (low, high) in radians, from low in [-π, π) counter-clockwise to high, at most one
-        turn further. Default: None, the set cannot be listed. Predictions print the listed parts.
+        turn further. Predictions print the listed parts. The default returns None, because the set cannot be listed.
         """
         return None
 
@@ -485,7 +490,8 @@ class ValueSet(ABC):
 def value_set(density: Distribution) -> ValueSet | None:
     """Return the prediction sets of a density, one for each item of its batch; None if it has none.
 
-    Default: None. A mixture, a power or a marginal of a density with sets has no sets either, since a guarantee for the
-    density does not hold for them. An affine transform (`affine.AffineDensity`) has the transformed sets.
+    The default returns None. A mixture, a power or a marginal of a density with sets has no sets either, since a
+    guarantee for the density does not hold for them. An affine transform (`affine.AffineDensity`) has the transformed
+    sets.
     """
     return None

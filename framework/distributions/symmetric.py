@@ -40,7 +40,8 @@ class Symmetric(PlainDensity):
     def half_width(self, mass: float) -> Tensor | None:
         """Return half the width of the interval around `location` with probability `mass`; None if it is not known.
 
-        The result is float64, (*batch, number). Default: None. Callers then invert the distribution function.
+        The result is float64, (*batch, number). The default returns None. Callers then invert the distribution
+        function.
         """
         return None
 

@@ -59,9 +59,9 @@ def outlier_score(density: Distribution) -> Float[Tensor, "*batch"] | None:
     """Return the outlier score of the input of each density, float64 (*batch); None if a density has no score.
 
     A score is high for inputs unlike the training data. Its unit depends on the wrapper that computes it; only the
-    order of scores has a meaning. Default: None. A mixture, a power or a marginal of a density with a score has none;
-    an affine transform of a density has the score of this density. A density that leaves another unchanged registers a
-    function that returns the score of this other density.
+    order of scores has a meaning. The default returns None. A mixture, a power or a marginal of a density with a score
+    has no score. An affine transform of a density has the score of this density. A density that leaves another density
+    unchanged registers a function that returns the score of this other density.
     """
     return None
 

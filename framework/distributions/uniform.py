@@ -20,9 +20,9 @@ from framework.errors import UserError
 def uniform(density: Distribution) -> Distribution:
     """Return the uniform distribution over the support of a density, with the same shapes.
 
-    Parts of the support of equal size are equally likely. Default: known for classes, and for angles that each cover
-    the whole circle. If the angles of a density are coordinates of another space (rotations, for example), it registers
-    the distribution that is uniform on that space.
+    Parts of the support of equal size are equally likely. The default is known for classes, and for angles that each
+    cover the whole circle. If the angles of a density are coordinates of another space (rotations, for example), the
+    density registers the distribution that is uniform on that space.
 
     Raises:
         UserError: no distribution is uniform over the support, or the density has not registered one.
