@@ -85,10 +85,11 @@ class DensityHead(nn.Module, ABC):
         return -self(raw).log_prob(target)
 
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Fit in place the parameters that gradients do not train, such as one concentration for all inputs (eq. 3.5).
+        """Fit in place the parameters that gradients do not train, such as one concentration for all inputs.
 
-        The framework calls it once after training, in evaluation mode and without gradient, with the whole validation
-        split. Fitted values are buffers, so that the checkpoint stores them. The default does nothing.
+        Thesis eq. 3.5 has such a concentration. The framework calls this method once after training, in evaluation mode
+        and without gradient, with the whole validation split. Fitted values are buffers, so that the checkpoint stores
+        them. The default does nothing.
         """
 
 

@@ -67,8 +67,8 @@ class Encoder(nn.Module, ABC):
 class FitsInputs(ABC):
     """Additional base class of an encoder that is fitted once to the inputs of the training split, before training.
 
-    Its fitted numbers are buffers, so that checkpoints store them. It is `Encoder.fixed`, and no encoder that is
-    trained may precede it. It also gives features before it is fitted.
+    The fitted numbers are buffers, so that checkpoints store them. The attribute `fixed` of the encoder must be True,
+    and no encoder that is trained may precede it. The encoder also returns features before it is fitted.
     """
 
     @abstractmethod

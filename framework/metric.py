@@ -108,4 +108,8 @@ class HasFigure(ABC):
         """Return the figure of all batches so far; called after `compute`.
 
         The method imports the module that draws, so that a metric that is only computed loads no Matplotlib.
+
+        Args:
+            title: title of the figure.
+            synthetic: whether the data are generated; the title then says so.
         """

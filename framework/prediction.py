@@ -30,7 +30,7 @@ class Prediction:
     Args:
         density: with batch_shape (batch,).
         batch: the fields of the batch, on the density's device.
-        samples: number of samples for a point prediction that has no closed form (S of eq. 3.24).
+        samples: number of samples for a point prediction that has no closed form (S of thesis eq. 3.24).
         split: source of the batch; the targets of outliers have no meaning.
         draw: source of random numbers; None uses the current state of torch's generators.
         reads: channels of images that will be requested, so that they are drawn together.
@@ -93,9 +93,9 @@ class Prediction:
 
     @cached_property
     def point(self) -> Tensor:
-        """Point prediction, shaped like the target: the value of smallest expected absolute deviation (eq. 3.23-3.24).
+        """Point prediction, shaped like the target: the value of smallest expected absolute deviation.
 
-        For classes it is the most likely class.
+        For classes it is the most likely class. The source is thesis eq. 3.23-3.24.
         """
         with self._draw("point"):
             return median(self.density, self.samples)
@@ -103,7 +103,7 @@ class Prediction:
     def interval(self, mass: float, draws: int = DRAWS) -> Interval:
         """Return the central interval of probability `mass` of each real or angle, with ends of shape (batch, number).
 
-        `framework.distributions.intervals` defines it.
+        `framework.distributions.intervals.central_interval` computes it, from `draws` draws if there is no closed form.
         """
         with self._draw("interval"):
             return central_interval(self.density, mass, draws)

@@ -185,7 +185,7 @@ def _kept_above(parents: Sequence[int], joint: int, kept_joints: dict[int, int])
 class BodyModel(nn.Module):
     """Differentiable model that returns the vertices of bodies from shape coefficients and joint rotations, in batches.
 
-    The vertices are X = W(T + B_S(β) + B_P(θ), J(β), θ) (eq. 7.1, 7.2; Loper et al. 2015). β are the shape
+    The vertices are X = W(T + B_S(β) + B_P(θ), J(β), θ) (thesis eq. 7.1-7.2; Loper et al. 2015). β are the shape
     coefficients, θ the joint rotations (the pose), T the template, B_S the displacements by `shapes`, B_P those by
     `pose_shapes`, J the joints in the rest pose, and W is linear blend skinning. The rotation of a joint is relative to
     its parent; in the rest pose its axes are the world axes. For a pose of zeros the vertices are the template plus the
@@ -272,7 +272,7 @@ class BodyModel(nn.Module):
     def skinning(
         self, shape: Float[Tensor, "batch shape"], pose: Float[Tensor, "batch joint 3"]
     ) -> Float[Tensor, "batch vertex 3 3"]:
-        """Return Σ_j w_j R_j of each vertex, the linear part of its skinning transform (W of eq. 7.1).
+        """Return Σ_j w_j R_j of each vertex, the linear part of its skinning transform (W of thesis eq. 7.1).
 
         w_j is the vertex's skinning weight of joint j, and R_j the rotation of joint j relative to the world.
         """

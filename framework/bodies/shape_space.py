@@ -18,9 +18,9 @@ DRAWN = 400
 def reduce_shapes(body: Body, traits: Traits | None) -> Body:
     """Return the body with at most COUNT shape coefficients, each of standard deviation 1 and of mean 0 among people.
 
-    For a body from a file, which has this scale already, only the first coefficients remain. For the default body,
-    random adults are drawn. The mean of their vertices becomes the template, and the principal components of their
-    vertices become the shapes, the largest first, with the sign that makes the person taller.
+    For a body from a file (`traits` is None), which has this scale already, only the first coefficients remain. For the
+    default body, random adults are drawn. The mean of their vertices becomes the template, and the principal components
+    of their vertices become the shapes, the largest first, with the sign that makes the person taller.
     """
     if traits is None:
         return replace(body, shapes=body.shapes[..., :COUNT], joint_shapes=body.joint_shapes[..., :COUNT])

@@ -123,6 +123,8 @@ def sheet(body: Body, stages: int = 2) -> Sheet:
 def topology(body: Body, surface: Sheet, name: Name) -> Topology:
     """Return the topology called `name`: the body decimated, unchanged, or with its longest edges split.
 
+    `surface` is the sheet of the body, from which the vertices are taken.
+
     The name stands for a number of vertices (COUNTS). For "7k", a body that has fewer vertices stays unchanged. For
     "27k" edges are split once at most and for "110k" twice at most, so a small body can have fewer vertices than the
     name says.

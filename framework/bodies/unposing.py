@@ -43,6 +43,8 @@ def unpose(
 ) -> Unposed:
     """Return the offsets with which the model, in the pose `pose`, has the vertices `vertices`, metres.
 
+    `shape`, `pose` and `translation` are arguments of `BodyModel.forward`.
+
     With A = Σ_j w_j R_j (`BodyModel.skinning`) the offsets are A⁻¹ r, where r is the difference of `vertices` from the
     vertices of the model without offsets in the same pose. This is exact, because skinning is affine and the pose blend
     shapes B_P(θ) are the same with and without offsets. Only r is multiplied by A⁻¹, so that the effect of errors of A

@@ -301,7 +301,7 @@ def predictor_weights(content: Mapping[str, Any]) -> dict[str, torch.Tensor]:
 
 
 def fill(predictor: Predictor, state: Mapping[str, torch.Tensor], name: str) -> None:
-    """Copy weights into a predictor.
+    """Copy the weights `state` from the checkpoint `name` into a predictor.
 
     Raises:
         CheckpointError: The weights belong to another model; the message says what does not fit.

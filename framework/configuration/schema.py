@@ -41,6 +41,10 @@ WRITTEN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 def forbid_targets(config: Any, path: str = "") -> None:
     """Refuse the key `_target_` at any depth, because a config contains names and values but never code.
 
+    Args:
+        config: A config, or a value in one.
+        path: Dotted key of `config` in the whole config, for the message; "" if it is the whole config.
+
     Raises:
         ConfigError: `config` contains a key `_target_`.
     """
@@ -154,6 +158,11 @@ def _error_line(error: BaseException, cls: type) -> str:
 
 def check(model: type[BaseModel], values: Mapping[str, Any], path: str) -> dict[str, Any]:
     """Validate `values` with a pydantic model, and return them with the defaults of the model.
+
+    Args:
+        model: The pydantic model.
+        values: Values by key.
+        path: Name of the config in messages.
 
     Raises:
         ConfigError: A key is unknown or missing, or a value has the wrong type or range; the message describes the

@@ -131,7 +131,11 @@ def collect(
 
 
 def subfolders(root: Path, remedy: str) -> list[Path]:
-    """Return the folders in `root`, sorted, without those whose names begin with a dot or an underscore."""
+    """Return the folders in `root`, sorted, without those whose names begin with a dot or an underscore.
+
+    Raises:
+        DataError: `root` is not a folder; the message ends with the advice `remedy`.
+    """
     if not root.is_dir():
         raise DataError(f"data.root = {root} does not exist or is not a folder. {remedy}")
     return sorted(path for path in root.iterdir() if path.is_dir() and path.name[0] not in "._")

@@ -494,6 +494,11 @@ def list_lines(items: Sequence[object]) -> str:
 def refuse_listed(wrong: Sequence[object], problem: str, remedy: str) -> None:
     """Raise an error that counts and lists the items in `wrong`; do nothing if there are none.
 
+    Args:
+        wrong: the items.
+        problem: noun for the items and their fault, which follows their number in the message.
+        remedy: advice, at the end of the message.
+
     Raises:
         DataError: `wrong` is not empty.
     """

@@ -36,6 +36,11 @@ NAME_WITHIN = 512
 def read_variables(file: Path, names: Sequence[str] | None = None, remedy: str = RESTORE) -> dict[str, Any]:
     """Read the named variables of a file, or all if `names` is None; see `parse_variables` for the result.
 
+    Args:
+        file: path of the file.
+        names: names of the variables.
+        remedy: advice in the message about a damaged file.
+
     Raises:
         DataError: the file does not exist, is damaged, or is of version 7.3.
     """

@@ -298,7 +298,10 @@ class ModelNoise:
         return Noise(self.kind, shape, self.dtype).draw(torch.Generator().manual_seed(seed))
 
     def dynamic_shape(self, batch: Any) -> dict[int, Any]:
-        """Return the dimensions that depend on the number of inputs, as torch.export wants them."""
+        """Return the dimensions that depend on the number of inputs, in the form of torch.export's `dynamic_shapes`.
+
+        `batch` is torch.export's symbol for the number of inputs.
+        """
         return {
             axis: multiple_of_batch(size) * batch
             for axis, size in enumerate(self.shape)

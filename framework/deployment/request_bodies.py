@@ -60,7 +60,7 @@ def content_type(headers: Mapping[bytes, bytes]) -> str:
 
 
 def require_bounded(body: bytes, kind: str) -> None:
-    """Raise a Refusal if a body is too large, too deeply nested or malformed.
+    """Raise a Refusal if a body of the media type `kind` is too large, too deeply nested or malformed.
 
     Raises:
         Refusal: the message names the fault and the remedy.

@@ -232,7 +232,10 @@ def require_few_numbers(rows: int, numbers: int) -> None:
 
 
 def sample_file(suffix: str, columns: Sequence[str]) -> bytes | None:
-    """Return the content of a small sample file in the format of a suffix; None for an unknown suffix."""
+    """Return the content of a small sample file in the format of a suffix; None for an unknown suffix.
+
+    `columns` are the column names of a table.
+    """
     if suffix == ".csv":
         return "\n".join([",".join(columns), *[",".join("0" for _ in columns)] * 2, ""]).encode()
     if suffix in (".png", ".jpg", ".jpeg"):

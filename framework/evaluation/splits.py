@@ -191,7 +191,14 @@ def silence() -> Iterator[None]:
 
 @torch.no_grad()
 def cost(predictor: Predictor, batch: Batch, *, samples: int, device: torch.device) -> Cost:
-    """Return the cost of predicting the density and the point prediction for a batch."""
+    """Return the cost of predicting the density and the point prediction for a batch.
+
+    Args:
+        predictor: the trained predictor; it is moved to `device`.
+        batch: the batch.
+        samples: as in `Prediction`.
+        device: device to predict on.
+    """
     predictor.eval().to(device)
 
     def predict(inputs: torch.Tensor) -> torch.Tensor:

@@ -325,7 +325,14 @@ def _check(
 def restored(
     predictor: Predictor, parts: Sequence[Uncertainty | DensityHead], knob: str, device: torch.device
 ) -> Iterator[None]:
-    """Set evaluation mode inside the block; afterwards restore the mode, the knob and the random generators."""
+    """Set evaluation mode inside the block; afterwards restore the mode, the knob and the random generators.
+
+    Args:
+        predictor: the predictor.
+        parts: wrappers or heads of the predictor that have the knob.
+        knob: name of the knob.
+        device: device of the predictor, whose random generator is restored.
+    """
     training = predictor.training
     before = [getattr(part, knob) for part in parts]
     try:

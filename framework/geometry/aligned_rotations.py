@@ -72,19 +72,24 @@ class Frame(NamedTuple):
 
 
 def log_prob(turn: Float[Tensor, "... 4"], parameter: Float[Tensor, "... 3 3"]) -> Float[Tensor, "..."]:
-    """Return the log-density, nats, float64, of the rotation with unit quaternion `turn`; batch shapes broadcast.
+    """Return the log-density of rotations, nats, float64; batch shapes broadcast.
 
-    Its first and second derivatives in both arguments are accurate everywhere, also where singular values are equal or
+    The first and second derivatives in both arguments are accurate everywhere, also where singular values are equal or
     zero: they are moments of the rotation, and are computed without division by a difference of singular values. The
     derivative in `turn` is only valid for changes that keep the quaternion of unit length.
+
+    Args:
+        turn: unit quaternions of the rotations.
+        parameter: F.
     """
     return _LogProb.apply(turn.double(), parameter.double())
 
 
 def mean_rotation(parameter: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Return the mean rotation matrix E R = U diag(d) Vᵀ, float64; differentiable once.
+    """Return the mean rotation matrix E R = U diag(d) Vᵀ of the density with F = `parameter`, float64.
 
-    E R is the derivative of log c(F) with respect to F, and d is the mean of the diagonal of UᵀRV (Lee 2018, Thm. 1).
+    The result can be differentiated once. E R is the derivative of log c(F) with respect to F, and d is the mean of the
+    diagonal of UᵀRV (Lee 2018, Thm. 1).
     """
     return _Mean.apply(parameter.double())
 
@@ -140,7 +145,7 @@ def second_moments(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"
 
 @torch.no_grad()
 def fourth_moments(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 4"]:
-    """Return E qᵢ²qⱼ² of the aligned quaternion q for i, j = 0, ..., 3, each to nearly full relative precision."""
+    """Return E qᵢ²qⱼ² of the aligned quaternion, i, j = 0, …, 3, to nearly full relative precision; `falls` are λ."""
     outer, inner, mass = _quadrature(falls)
     mass = mass / mass.sum(-1, keepdim=True)
     blocks = []
@@ -164,8 +169,9 @@ def fourth_moments(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 
 
 @torch.no_grad()
 def sample(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
-    """Return one aligned quaternion per element by rejection (Kent, Ganeiber & Mardia 2018, §3), float64.
+    """Return one random aligned quaternion q per element of the batch, float64; `falls` are λ.
 
+    The method is rejection sampling (Kent, Ganeiber & Mardia 2018, §3).
     The proposal is the angular central Gaussian z/|z| with zᵢ ~ N(0, 1/(1 + 2λᵢ/b)); b solves Σᵢ 1/(b + 2λᵢ) = 1,
     with λ₀ = 0 included. Elements without an accepted proposal after SAMPLING_ROUNDS keep their last proposal, so that
     the loop always ends.

@@ -266,7 +266,13 @@ def denormalise_clouds(
     centre: Float[Tensor, "batch 3"],
     scale: Float[Tensor, "batch"],
 ) -> Float[Tensor, "batch points columns"]:
-    """Return normalised points in their cloud's own units, of the input's dtype; their attributes are unchanged."""
+    """Return normalised points in their cloud's own units, of the input's dtype; their attributes are unchanged.
+
+    Args:
+        points: normalised points, (batch, points, columns).
+        centre: centre of each cloud, as in `NormalisedClouds`.
+        scale: scale of each cloud, as in `NormalisedClouds`.
+    """
     back = points[..., :3] * scale[:, None, None] + centre[:, None]
     return torch.cat([back.to(points.dtype), points[..., 3:]], -1)
 

@@ -115,7 +115,7 @@ def _lines(content: bytes, comment: bytes | None, names: Sequence[bytes]) -> lis
 
 
 def numbers(lines: Sequence[bytes], dtype: type = np.float64, place: Place | None = None) -> NDArray:
-    """Return all numbers in `lines`, concatenated.
+    """Return all numbers in `lines`, concatenated, as an array of type `dtype`.
 
     Raises:
         ValueError: a word is not a number; the message names the line if `place` is given.
@@ -183,6 +183,7 @@ def polygons(lines: Sequence[bytes], place: Place | None = None) -> Int[np.ndarr
     """Return the triangles of the faces that `lines` describe.
 
     Each line describes one face: the number of its corners, then the corners, then any words, which are skipped.
+    `place` gives the line's number in the file for error messages.
     """
     if not lines:
         return np.empty((0, 3), np.int64)

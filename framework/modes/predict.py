@@ -158,13 +158,20 @@ def predictions(
     """Return the columns of the CSV table by name, and the tensors from which the data set draws maps.
 
     A row has the name of a sample, the point prediction, the entropy of the density in nats, and the prediction set. If
-    the model predicts no sets, the row has the interval of probability `mass` instead; None leaves it out. The row also
-    has the standard errors of the interval's ends if these are estimated from random values. If the data set draws maps
-    of `files`, the tensors are, for each batch, the point predictions and the standard deviations, each (batch,
-    number); otherwise there are no tensors.
+    the model predicts no sets, the row has the central interval instead. The row also has the standard errors of the
+    interval's ends if these are estimated from random values. If the data set draws maps of `files`, the tensors are,
+    for each batch, the point predictions and the standard deviations, each (batch, number); otherwise there are no
+    tensors.
 
-    Predicted images are written to the folder `images`, and the row contains the name of the image file. `examine` is
-    called with the first batch.
+    Args:
+        predictor: Trained predictor.
+        data: Data set that reads the files, or whose test split is predicted.
+        target: Target that is predicted.
+        files: Files to predict for; empty for the test split.
+        settings: Settings of the command, of which `seed`, `samples` and `workers` are used.
+        images: Folder for predicted images; the row then contains the name of the image file.
+        mass: Probability of the interval; None leaves it out.
+        examine: Function that is called with the first batch.
     """
     dataset = data.read(files) if files else data.splits().test
     loader = Batches(data, batch_size=BLOCK, workers=settings.workers, seed=settings.seed).of(dataset)
@@ -248,7 +255,7 @@ def format_cells(column: Sequence[Any] | Tensor, key: str) -> Iterator[str]:
     """Yield the texts of a column, with 15 significant digits for the ends of intervals and 10 for other numbers.
 
     The ends of an interval need more digits, because they may differ little compared with their size in the user's
-    unit.
+    unit. `key` is the name of the column, which tells whether it holds such ends.
     """
     pattern = "%.15g" if key.endswith(ENDS) else "%.10g"
     for value in column.tolist() if isinstance(column, Tensor) else column:

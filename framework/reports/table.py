@@ -90,7 +90,13 @@ def _add_arrows(heads: Sequence[Text], columns: Mapping[str, str], better: objec
 
 
 def markdown(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | None = None) -> str:
-    """Return a table of the results in Markdown; if any result is synthetic, a column says which ones are."""
+    """Return a table of the results in Markdown; if any result is synthetic, a column says which ones are.
+
+    Args:
+        rows: as for `results_table`.
+        columns: as for `results_table`.
+        better: directions of the columns in which the best number may be bold; None: no number is bold.
+    """
     lines = _lines(rows, columns, better or {}, origin=any(map(_synthetic, rows)))
     cells = [[_escape(cell) for cell in line] for line in lines]
     rule = ["---", *["---:"] * (len(cells[0]) - 1)]
@@ -103,6 +109,11 @@ def html(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | No
     """Return a table of the results in HTML; the attribute `data-value` of a cell is the number to sort by.
 
     If any result is synthetic, a column says which ones are.
+
+    Args:
+        rows: as for `results_table`.
+        columns: as for `results_table`.
+        better: as for `results_table`; None: no number is bold, and no heading has an arrow.
     """
     lines = _lines(rows, columns, better or {}, origin=any(map(_synthetic, rows)))
     _add_arrows(lines[0], columns, better)
@@ -124,6 +135,11 @@ def latex(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | N
     """Return a table of the results in LaTeX; the table needs no LaTeX package.
 
     If any result is synthetic, a column says which ones are.
+
+    Args:
+        rows: as for `results_table`.
+        columns: as for `results_table`.
+        better: directions of the columns in which the best number may be bold; None: no number is bold.
     """
     lines = _lines(rows, columns, better or {}, origin=any(map(_synthetic, rows)))
     head, *body = (" & ".join(_latex_cell(cell) for cell in line) + r" \\" for line in lines)

@@ -105,8 +105,8 @@ def try_lock(path: Path) -> tuple[int, OSError | None] | None:
     processes do not inherit.
 
     Returns:
-        None if another process holds the lock. Otherwise a pair: the descriptor of the lock, and None or, if the file
-        system has no locks at all, its error.
+        None if another process holds the lock, otherwise a pair. Its first element is the descriptor of the lock. Its
+        second element is None or, if the file system has no locks at all, the error of the file system.
     """
     descriptor, missing = os.open(path, os.O_RDWR | os.O_CREAT, 0o644), None
     for lock in (fcntl.flock, fcntl.lockf):

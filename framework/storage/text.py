@@ -107,7 +107,7 @@ def column_name(cell: str) -> str:
 
 
 def require_distinct(names: Sequence[str], kind: str = "column") -> None:
-    """Refuse a list of names in which a name occurs twice; empty names may repeat.
+    """Refuse a list of names in which a name occurs twice; empty names may repeat. `kind` says what has the names.
 
     Raises:
         ValueError: A name occurs twice; the message quotes the first such name.
@@ -287,7 +287,10 @@ def require_numbers_in(words: Sequence[str], text: str, first: int = 0) -> list[
 
 
 def describe_no_number(word: str, where: str = "") -> str:
-    """Return the error message for a word that is not a number, with a correction if there is one."""
+    """Return the error message for a word that is not a number, with a correction if there is one.
+
+    `where` is the text in the message that follows the word and says where it stands.
+    """
     remedy = suggest_number(word)
     why = f", which is a number {remedy.form}; write {remedy.number}" if remedy else ""
     return f"expected a number, got {quote(word)}{where}{why}"

@@ -40,7 +40,10 @@ class Share:
 
 
 def rank_share(count: int, device: torch.device) -> Share:
-    """Return the share of the whole batch that this rank's `count` rows form; every rank must call this function."""
+    """Return the share of the whole batch that this rank's `count` rows form; every rank must call this function.
+
+    `device` is the device of this rank, on which the ranks exchange their counts.
+    """
     counts = [torch.zeros((), dtype=torch.int64, device=device) for _ in range(dist.get_world_size())]
     dist.all_gather(counts, torch.tensor(count, device=device))
     sizes = [int(count) for count in counts]

@@ -224,7 +224,10 @@ def curves(bits: int) -> NDArray[np.int32]:
 
 
 def packed_once(points: Array) -> Packed:
-    """Pack queries that are used once, as fast as possible: the packets follow the Hilbert curve (`pack`)."""
+    """Pack queries (query, 3) that are used once, as fast as possible: the packets follow the Hilbert curve (`pack`).
+
+    Queries with coordinates that are not finite or of extreme magnitude are packed by `packed_well`.
+    """
     size, box = len(points), np.empty(6, points.dtype)
     low, high = MODERATE[points.itemsize]
     flat = points.reshape(-1)
@@ -237,7 +240,7 @@ def packed_once(points: Array) -> Packed:
 
 
 def packed_well(points: Array) -> Packed:
-    """Pack queries that are used often: the packets come from repeated halving at the median.
+    """Pack queries (query, 3) that are used often: the packets come from repeated halving at the median.
 
     This takes longer than `packed_once`, but the boxes of the packets are smaller.
     """
@@ -424,7 +427,13 @@ def solve_one(problem: Problem, i: int, cells: NDArray[np.int32], threads: int) 
 
 
 def extent_together(cloud: Array, size: int, threads: int) -> Array | None:
-    """Return the box that `pack.extent` computes, with several threads; None if a number is not finite."""
+    """Return the box that `pack.extent` computes, with several threads; None if a number is not finite.
+
+    Args:
+        cloud: flat array.
+        size: number of points.
+        threads: number of threads.
+    """
     threads = max(1, min(threads, size // LARGE))
     cuts = [size * thread // threads for thread in range(threads + 1)]
     boxes, finite = np.empty((threads, 6), cloud.dtype), [False] * threads

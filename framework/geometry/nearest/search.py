@@ -123,7 +123,13 @@ def to_box(box, nodes, node, query, zero):
 @inlined
 @no_type_check
 def to_point(points, at, query):
-    """Return the squared distances of 16 queries from the point whose x is stored at index `at` of `points`."""
+    """Return the squared distances of 16 queries from one point of a leaf.
+
+    Args:
+        points: the leaves (`Packed.points`).
+        at: index in `points` of the x of the point.
+        query: vectors x, y, z of the 16 queries.
+    """
     return squared_length(
         splat(take(points, at)) - query[0],
         splat(take(points, at + 16)) - query[1],
@@ -267,6 +273,12 @@ def descend(packed, x, y, z):
     """Return the position of a point near a query, found by following the nearest box of each level.
 
     The position is 16 times the index of the leaf, plus the index of the point in the leaf.
+
+    Args:
+        packed: the cloud.
+        x: x of the query.
+        y: y of the query.
+        z: z of the query.
     """
     points, _, box, _, levels = packed
     nodes = box.shape[0] // 6
