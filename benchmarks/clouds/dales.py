@@ -128,8 +128,11 @@ def conclusion(rows: Sequence[Mapping[str, Any]]) -> str:
         for row in near
         if row is not fastest
     ]
-    text = f"**{fastest['method']}** is the fastest of the methods with the highest accuracy within the standard error"
-    return f"{text}; the others are {', '.join(others)}." if others else f"{text}, and the only one."
+    text = (
+        "Of the methods whose accuracy is the highest, or is equal to the highest within the standard error, "
+        f"**{fastest['method']}** is the fastest."
+    )
+    return f"{text} The other methods with such an accuracy are: {', '.join(others)}." if others else text
 
 
 def main() -> None:
@@ -137,21 +140,23 @@ def main() -> None:
     rows = [row(experiment, folds) for experiment, folds in results.items()]
     draw(rows)
     count = sum(fold["test_samples"] for fold in next(iter(results.values())))
-    epochs = "200 epochs; PointNet, whose epochs take far longer, 40"
+    epochs = "200 epochs, except PointNet: its epochs take far longer, so it is trained for 40 epochs"
     text = (
         "# Objects of airborne laser scans (DALES, real data)\n\n"
         "This page compares encoders of point clouds on real objects from airborne laser scans. The data set has "
         f"{count} objects of five classes, with 101 to 28,100 points each. It is divided into 5 folds, and each fold "
         "is the test split of one run, so that each object is tested once. The text at the top of `dales.py` lists "
         f"the commands that train the models. Each model is trained for {epochs}.\n\n"
-        "*basis points* describes a cloud by its distances from 512 basis points (`bps`). *Point-NN* describes it by "
-        "sines and cosines of 512 points, pooled over 40 neighbours (`point_nn`). Both have no trained parameters; two "
-        "layers of 400 units follow them. *Deep Sets* and *PointNet* are trained networks on the points (`deepsets`, "
-        "`pointnet` without its matrices).\n\n"
+        "*basis points* describes a cloud by the distances from 512 basis points to its nearest points (`bps`). "
+        "*Point-NN* describes it by sines and cosines of 512 points, pooled over 40 neighbours (`point_nn`). "
+        "Both have no trained parameters; two layers of 400 units follow them. *Deep Sets* and *PointNet* are "
+        "trained networks on the points (`deepsets`, and `pointnet` without the matrices that transform points "
+        "and features).\n\n"
         "Accuracy is the share of objects that are classified correctly. NLL is the mean negative log-likelihood of "
         "the true class; lower is better. ECE is the expected calibration error; 0 is best. The spread is the standard "
-        "deviation of the accuracy over the folds. MFLOP counts the operations of matrix products alone, and not the "
-        "search for neighbours or the sines; ms per cloud is measured on one thread and contains everything.\n\n"
+        "deviation of the accuracy over the folds. MFLOP counts the operations of matrix products only; it "
+        "leaves out the search for neighbours and the sines. ms per cloud is the time of a whole prediction on "
+        "one thread.\n\n"
         f"{markdown(rows, COLUMNS)}\n"
         f"{conclusion(rows)}\n\n"
         "![Accuracy and run time](dales.png)\n\n"

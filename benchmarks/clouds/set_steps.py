@@ -162,8 +162,8 @@ def main() -> None:
 
 This page shows how much time and memory a training step of a network for point sets saves if only some points have a
 gradient. These networks compute the maximum of each channel over the points of a cloud, and only the points that attain
-a maximum influence the result. The column names say whether these "attaining points" or "every point" pass the last
-layers with a gradient. The page is written by `python -m benchmarks.clouds.set_steps`.
+a maximum influence the result. The column names say for which points the last layers compute a gradient: only for these
+"attaining points", or for "every point". The page is written by `python -m benchmarks.clouds.set_steps`.
 
 A training step is the forward and the backward pass of {BATCH} clouds (synthetic CAD models) in float32 on one
 thread. The step is measured after {TRAINED} steps of training. Steps with "every point" and with the "attaining

@@ -160,11 +160,13 @@ def main() -> None:
             "",
             "## Mode",
             "",
-            "The table shows the time to find the mode of one mixture of K components of different widths. With "
-            "2,048 components or more, the density at the modes of all components is interpolated, in time K log K. "
-            "The column `all pairs` is the time to compute this density for all pairs of components, without the "
-            "search uphill that follows. The last column is 0 or more if the found mode is at least as high as the "
-            "mixture is at the mode of each component.",
+            "The table shows the time to find the mode of one mixture of K components of different widths. The "
+            "search first computes the density of the mixture at the modes of all components, and then climbs "
+            "from a few of the highest. With 2,048 components or more, these densities are interpolated, in a "
+            "time that grows with K log K. The column `all pairs` is the time to compute them without "
+            "interpolation, from all pairs of components, and without the climb. The last column is the "
+            "log-density of the mixture at the found mode, minus its highest log-density at the mode of a "
+            "component. It should be 0 or more.",
             "",
             *mode_table(),
             "",

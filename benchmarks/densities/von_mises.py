@@ -288,11 +288,12 @@ def time_coverage() -> list[str]:
         metric = Coverage(target)
         times = time_interleaved({"coverage": partial(metric.update, prediction)}, seconds=0.2)["coverage"]
         texts.append(
-            f"{Rounds(tuple(number / rows for number in times.milliseconds)).text()} ms for {rows:,} rows"
+            f"{Rounds(tuple(number / rows for number in times.milliseconds)).text()} ms in a batch of {rows:,} "
+            "rows"
         )
     return [
-        "The metric `coverage` takes, for each row of a batch of von Mises densities of one angle, "
-        f"{' and '.join(texts)} in float32."
+        "For von Mises densities of one angle in float32, the metric `coverage` takes this time per row: "
+        f"{' and '.join(texts)}."
     ]
 
 
@@ -309,8 +310,8 @@ def time_first_calls() -> list[str]:
     return [
         "The first log-density and gradient of von Mises densities with 10,000 elements in a process takes "
         f"{cold:.2g} s without a cache of compiled code and {warm:.2g} s with one; most of the latter time is the "
-        f"import of numba. Processes that only compute fewer than {FEWEST:,} elements at once, or {FEWEST_ONCE:,} "
-        "without gradients, do not import it."
+        f"import of numba. A process imports numba only if it computes at least {FEWEST:,} elements at once with "
+        f"gradients, or at least {FEWEST_ONCE:,} without gradients."
     ]
 
 
@@ -386,9 +387,9 @@ def report() -> str:
             "",
             "The table gives the largest errors of the log-density log p of a von Mises density, of its derivatives "
             "in κ and μ, and of the entropy, in machine epsilons of the dtype. The references have 60 digits. The "
-            "mean μ is 3 rad, and the angle φ differs from it by 0 to ±1e6 rad. Few elements are computed by torch "
-            f"operations, and {FEWEST:,} or more (many) by compiled code; `torch.compile` is the code that torch "
-            "compiles.",
+            "mean μ is 3 rad, and the angle φ differs from it by 0 to ±1e6 rad. The column `elements` names the "
+            "code that is used: torch operations for `few` elements, the project's compiled code for `many` "
+            f"({FEWEST:,} or more), and the code that torch compiles for `torch.compile`.",
             "",
             "The errors of the log-density log p and of the entropy of a von Mises density are relative to max(1, "
             "|reference|). The error of d/dμ is relative to the reference. The error of d/dκ is relative to "

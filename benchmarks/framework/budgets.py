@@ -186,18 +186,23 @@ def main() -> None:
 
 PAGE = """# Budgets
 
-Does the setting that `framework.load(run, budget=...)` chooses meet its limit if it is measured anew?
+This page tests whether the setting that `framework.load(run, budget=...)` chooses meets its limit of run time or error
+if it is measured anew. The command of the page is:
 
     python -m benchmarks.framework.budgets
 
-Each model is trained for a short time on synthetic data, and gets two limits: the middle between the run times of its
-stored and its cheapest setting, and the middle between their errors. `milliseconds` limits the time of one sample in a
-batch of {batch} on one thread: density, point prediction and error measure. After the choice, run time and error are
-measured again, by code of this script: times are medians over five interleaved rounds (least to largest round), and
-errors are means over at most {samples} validation samples, with other random numbers than the choice used. *new /
-limit* is this measurement divided by the limit (if errors can be negative: one plus the excess as a share of the
-limit); the largest is {worst:.2f}. *faster* compares with the stored setting in the same rounds; *test error* is the
-error of the stored and of the chosen setting on the test split.
+Each model is trained for a short time on synthetic data. A setting is chosen for each of two limits: a limit of the run
+time, halfway between the run times of the stored setting and of the cheapest one, and a limit of the error, halfway
+between their errors. The run time (`milliseconds`) is the time of the density, the point prediction and the error
+measure for one sample, in a batch of {batch} on one thread.
+
+After the choice, this script measures run time and error again with code of its own. Times are medians over five
+interleaved rounds (least to largest round). Errors are means over at most {samples} validation samples, with random
+numbers that the choice did not use. The columns of the table are:
+- *new / limit*: the new measurement divided by the limit. If errors can be negative, it is 1 plus the excess over the
+  limit, as a share of the limit. A value of at most 1 meets the limit; the largest value is {worst:.2f};
+- *faster*: how many times as fast the chosen setting is as the stored one, in the same rounds;
+- *test error*: the error of the stored and of the chosen setting on the test split.
 
 | model | measure | limit | stored → chosen | ms per sample | validation error | new / limit | faster | test error |
 |---|---|---|---|---|---|---|---|---|

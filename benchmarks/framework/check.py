@@ -91,11 +91,11 @@ normal density. A row with **missed** is a planted fault that `mode=check` did n
 
 ## False alarms
 
-Number of false alarms of `mode=check`, which are failed tests of correct density heads:
-{sum(map(len, failed.values()))}. It tested {rows} configurations of the density heads of this project with {seeds}
-random seeds each. It also tested {right_rows} configurations of correct density heads that are not part of this project
-(tests/right_heads.py). Each line of the following list names the random seeds, the density head, its configuration and
-the property whose test failed:
+The number of false alarms of `mode=check`, which are failed tests of correct density heads, is
+{sum(map(len, failed.values()))}. `mode=check` tested {rows} configurations of the density heads of this project with
+{seeds} random seeds each. It also tested {right_rows} configurations of correct density heads that are not part of this
+project (tests/right_heads.py). Each line of the following list names the random seeds, the density head, its
+configuration and the property whose test failed:
 {chr(10).join(alarm_lines)}
 
 {machine("torch", "numpy")} Command: `python -m benchmarks.framework.check`. Run time: {minutes:.0f} minutes.
@@ -111,7 +111,7 @@ def read_page() -> tuple[list[str], int, dict[str, list[int]], float]:
         for line in text.splitlines()
         if line.startswith("| ") and not line.startswith(("| fault", "| ---"))
     ]
-    (seeds,) = re.findall(r"with (\d+) random seeds each", text)
+    (seeds,) = re.findall(r"with\s+(\d+)\s+random\s+seeds\s+each", text)
     (minutes,) = re.findall(r"(\d+) minutes\.$", text, re.MULTILINE)
     alarm_matches = re.findall(r"^- seeds? ([\d, ]+): (.*)$", text, re.MULTILINE)
     return (

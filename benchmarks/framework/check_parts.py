@@ -177,7 +177,7 @@ def write(
     ]
     write_page(
         __file__,
-        f"""# What `mode=check` finds in plugins of the group {group}
+        f"""# What `mode=check` finds in plugins of the registry `{group}`
 
 This page shows how well `mode=check` finds errors in plugins of the registry `{group}`. The benchmark counts two
 things: the planted faults that `mode=check` finds, and its false alarms. A planted fault is a known error that is put
@@ -196,9 +196,10 @@ The column `fault` names the change, and `failed properties` lists every propert
 
 ## False alarms
 
-Number of false alarms of `mode=check`, which are failed tests of correct plugins: {len(alarms)}. It tested {rows}
-constructions of the plugins of this project and {external} correct {"plugin" if external == 1 else "plugins"} that
-{"is" if external == 1 else "are"} not part of it, with {seeds} random seeds each.
+The number of false alarms of `mode=check`, which are failed tests of correct plugins, is {len(alarms)}. `mode=check`
+tested {rows} constructions of the plugins of this project and {external} correct
+{"plugin" if external == 1 else "plugins"} that {"is" if external == 1 else "are"} not part of it, with {seeds} random
+seeds each.
 
 {chr(10).join(f"- {alarm}" for alarm in alarms)}
 

@@ -190,11 +190,12 @@ def main() -> None:
         lines += measure(case) if name in names else old
     text = (
         "# Deployed models: run time of four forms on one core\n\n"
-        "This page compares the time of a prediction of six models in the forms in which this project deploys them, "
-        "with the PyTorch model and with ONNX Runtime. `frozen` is `framework.freeze(run).density`, which needs "
-        "PyTorch. `exported folder` is the model of [`mode=export`](../../docs/export.md), which needs NumPy and ONNX "
-        "Runtime alone. `ONNX Runtime` is a session of the same file, which returns the parameters of the density and "
-        "checks no inputs; the other forms return a density.\n\n"
+        "This page measures how long a prediction of six models takes in the forms in which this project deploys "
+        "them. It compares these forms with the PyTorch model and with ONNX Runtime alone. `frozen` is "
+        "`framework.freeze(run).density`, which needs PyTorch. `exported folder` is the model of "
+        "[`mode=export`](../../docs/export.md), which needs NumPy and ONNX Runtime alone. `ONNX Runtime` is a "
+        "session of the same file, which returns the parameters of the density and checks no inputs; the other "
+        "forms return a density.\n\n"
         f"`ms a call` is the processor time of a call with the whole batch: the median of {ROUNDS} interleaved rounds, "
         "with the smallest and the largest one in brackets. `of the best` is the time divided by the time of the "
         "fastest form. The weights are random.\n\n"
@@ -206,9 +207,9 @@ def main() -> None:
         "nor returns a density. The exported folder does both with NumPy, which takes 0.01 to 0.3 ms more for one "
         "input. The frozen model does both with PyTorch, which takes longer. For basis points, the frozen model "
         "searches for the nearest points with compiled code, but an ONNX file can only multiply matrices.\n\n"
-        "A model with random weights may be refused because of its rounding in float32. For extreme inputs, the "
-        "numbers in its layers are large, and where its result is close to 0, their rounding is a large share of "
-        "it.\n\n"
+        "`mode=export` refuses a model if the exported network differs too much from it, which may happen with "
+        "random weights. For extreme inputs, the numbers in the layers of such a model are large. If its result "
+        "is nevertheless close to 0, the rounding of these numbers to float32 is a large share of the result.\n\n"
         f"{machine('torch', 'onnxruntime', 'numpy')} Command: `python -m benchmarks.framework.deployed`.\n"
     )
     write_page(__file__, text)

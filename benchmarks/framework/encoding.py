@@ -178,12 +178,13 @@ def page(results: dict[str, Any]) -> str:
         [
             "# Encoding many point clouds",
             "",
-            f"This page compares `mode=encode` with the encoder alone, on {CLOUDS:,} clouds of {POINTS:,} points "
-            f"(synthetic, normal densities; {CLOUDS * POINTS * 12 / 1e9:.1f} GB), the encoder `bps` with {BASIS} basis "
-            f"points, and batches of {BATCH}. The clouds are in {CLOUDS // PART} shards. A sweep of {CORES} jobs with "
-            "one thread each encodes them: `python -m framework -m " + " ".join((*SHARES, *SETTINGS)) + " "
-            "mode.files=<shards> mode.into=<features>`. The encoder alone reads clouds in memory, in one process with "
-            "one thread. The two alternate.",
+            "This page compares the speed of `mode=encode` with the speed of the encoder alone. The encoder is "
+            f"`bps` with {BASIS} basis points. It encodes {CLOUDS:,} synthetic clouds of {POINTS:,} normally "
+            f"distributed points ({CLOUDS * POINTS * 12 / 1e9:.1f} GB) in batches of {BATCH}. The clouds are in "
+            f"{CLOUDS // PART} shards, which are files of many clouds. A sweep of {CORES} jobs with one thread "
+            "each encodes them: `python -m framework -m " + " ".join((*SHARES, *SETTINGS)) + " "
+            "mode.files=<shards> mode.into=<features>`. The encoder alone reads clouds in memory, in one process "
+            "with one thread. The sweep and the encoder alone are measured in turn.",
             "",
             f"All numbers are medians of {ROUNDS} rounds, with the least and the largest in brackets.",
             "",
@@ -197,20 +198,21 @@ def page(results: dict[str, Any]) -> str:
             f"| the same, whole command with its start | "
             f"{median_and_range([CLOUDS / seconds for seconds in wall], 4)} | {median_and_range(whole, 2)} |",
             "",
-            f"The last column is the rate divided by {CORES} × the rate of the encoder alone on one core. "
-            "Processes that run at once share the memory of the machine: the rate of the jobs is "
+            "The last column is the rate of the row, divided by the rate of the encoder alone on the same number "
+            f"of cores (for {CORES} cores: {CORES} × its rate on one core). Processes that run at once share the "
+            f"memory of the machine, which slows them down: the rate of the {CORES} jobs is "
             f"{median_and_range(ratio_together, 2)} times the rate of {CORES} processes of the encoder at once.",
             "",
-            f"Before and after the encoding, the command takes {median_and_range(beyond, 2)} s (imports, composition "
-            f"of the config, end of the sweep). This is as long as the encoding of {CLOUDS:,} clouds itself. For a "
-            f"million clouds, the last column would be {million:.2f} for the whole command "
-            "(computed from these two times, not measured). A "
-            f"command without a sweep that encodes {PART} clouds takes {median_and_range(starts, 2)} s of processor "
-            f"time and {median_and_range(start_wall, 2)} s of wall time, nearly all of it its start.",
+            f"Before and after the encoding, the command takes {median_and_range(beyond, 2)} s (imports, "
+            "composition of the config, end of the sweep). This is about as long as the encoding of the "
+            f"{CLOUDS:,} clouds itself. With a million clouds, the last column for the whole command would be "
+            f"{million:.2f} (computed from these two times, not measured). A command without a sweep that encodes "
+            f"{PART} clouds takes {median_and_range(starts, 2)} s of processor time and "
+            f"{median_and_range(start_wall, 2)} s of wall time, nearly all of it its start.",
             "",
-            "The same sweep was killed five times (SIGKILL of the command), after which "
-            f"{', '.join(map(str, results['killed']))} of {CLOUDS // PART} parts existed, and then "
-            f"finished. The bytes of all {results['compared']} files "
+            "In another test, the command of the same sweep was killed five times (SIGKILL) and repeated each "
+            f"time. After the kills, {', '.join(map(str, results['killed']))} of the {CLOUDS // PART} parts "
+            f"existed; the last repetition finished the sweep. The bytes of all {results['compared']} files "
             + ("equal" if results["same"] else "DIFFER FROM")
             + " those of the undisturbed sweep.",
             "",

@@ -164,8 +164,8 @@ def main() -> None:
             "",
             "This page compares the engines of a sweep (`hydra/launcher`) on one machine. The jobs do nothing: each is "
             "an empty Python script. So the time of a sweep is what the command, the engine and the start of Python "
-            "take. The forks have imported no PyTorch; [sweep_start](sweep_start.md) measures what forks save in "
-            "training runs.",
+            "take. The pool starts its jobs as forks of a process, which here has not imported PyTorch; "
+            "[sweep_start](sweep_start.md) measures what forks save in training runs.",
             "",
             f"Each engine runs a sweep of {JOBS} jobs. The pool runs {AT_ONCE} jobs at once. SLURM has two nodes of "
             "two cores each on this machine (real daemons on loopback), and runs four jobs at once. Ray starts a local "

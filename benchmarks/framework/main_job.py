@@ -199,9 +199,9 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         "numbers fast.",
         "",
         "Wall time and processor time in the table include the whole command with all its processes. The times of "
-        "the parts are differences of times in the journal of the run. Each cell is the "
-        "median over the seeds (least to largest), which are the rounds: in each round, the versions run one after "
-        "the other. Errors are the mean over the seeds ± their standard deviation.",
+        "the parts are differences of times in the journal of the run. There is one round for each seed, in which "
+        "the versions run one after the other. Each cell is the median over the seeds (least to largest). Errors "
+        "are the mean over the seeds ± their standard deviation.",
     ]
     for epochs in sorted({row["epochs"] for row in rows}, reverse=True):
         form = (

@@ -211,10 +211,11 @@ def page(measured: dict[str, Any]) -> str:
             "This page holds the measured costs from which [docs/scale.md](../../docs/scale.md) computes limits. Times "
             f"are medians of {ROUNDS} rounds, with the least and the largest in brackets.",
             "",
-            f"The stored run is `{' '.join(RUN)}`, with {counts}; the store holds copies of it. The cost of a job is "
-            f"the difference between the costs of a sweep of {MANY} jobs and of one of {FEW} jobs (`mode=plugins`), "
-            f"divided by {MANY - FEW}. Other work used a core of the machine while the jobs and the store were "
-            "measured, so their wall times are upper bounds.",
+            f"The stored run is `{' '.join(RUN)}`, which has {counts} in MLflow; the store is filled with copies "
+            "of this run. The jobs of the sweeps do almost nothing (`mode=plugins`). The cost of a job is the "
+            f"difference between the costs of a sweep of {MANY} jobs and of one of {FEW} jobs, divided by "
+            f"{MANY - FEW}. Other work used a core of the machine while the jobs and the store were measured, so "
+            "their wall times are upper bounds.",
             "",
             "| cost | measured | unit |",
             "|---|---:|---|",

@@ -239,11 +239,13 @@ def introduction() -> Sequence[str]:
         "learning rates and one or two dropout rates (0; 0 and 0.25).",
         "",
         "The error is the best validation loss. The run time is the number of milliseconds per sample on one "
-        "thread. It is the median over all trials of the table whose networks have the same widths, because a "
-        "single measurement, while another trial runs, differs by more than 5 %. A point beats another if it is "
-        f"better in one of the two and not worse in the other; run times within {100 * TIME_NOISE:g} % count as "
-        "equal, and losses are compared exactly. The dominated area is the area below the worst point, in nats "
-        "times the logarithm of the run time, divided by the dominated area of all trials together; higher is better.",
+        "thread. A single measurement varies by more than 5 %, because another trial runs at the same time. The "
+        "run time of a network is therefore the median over all trials of the table whose networks have the same "
+        "widths. A point beats another if it is better in one of the two and not worse in the other; run times "
+        f"within {100 * TIME_NOISE:g} % count as equal, and losses are compared exactly. The dominated area "
+        "measures a whole front: it is the area between the front and the worst point of the table, in nats "
+        "times the logarithm of the run time, divided by this area for the front of all trials together. Higher "
+        "is better.",
         "",
         "A grid contains the ends of the intervals, which a search hardly ever draws. A grid therefore has an "
         "advantage where the best settings are at an end, as a learning rate of 0.025 and a dropout rate of 0 are "

@@ -376,9 +376,10 @@ def write(lines: Sequence[dict[str, str]]) -> None:
         + "\nThe project requires at least 400 requests per second for the table and 150 for clouds, p99 of at most "
         "50 ms, and at most 200 ms for the first request.\n\n"
         f"The script sends {MALFORMED:,} malformed requests to the exported service of each model, among them JSON of "
-        f"up to 100,000 nested brackets. Answers, as number × status: {refusals}. Status 200 belongs to bytes that "
-        "were changed at random and still are a valid request. No answer held a path of the server, and the service "
-        "answered a good request afterwards.\n\n"
+        f"up to 100,000 nested brackets. The answers were (number × HTTP status): {refusals}. Status 400 is an "
+        "error message. Status 200, a prediction, would be right only for bytes that were changed at random and "
+        "still are a valid request. No answer held a path of the server, and the service answered a good request "
+        "afterwards.\n\n"
         f"{machine('onnxruntime', 'fastapi', 'uvicorn', 'mlflow', 'numpy')} "
         "Command: `python -m benchmarks.framework.serving`.\n"
     )

@@ -145,12 +145,15 @@ def conclusion(runs: Mapping[str, list[tuple[Path, Mapping[str, Any]]]]) -> str:
     cheapest = (
         f"It is also the fastest, with {costs[best]:.1f} ms per image."
         if fastest == best
-        else f"It takes {costs[best]:.1f} ms per image. The fastest, {NAMES[fastest]}, takes {costs[fastest]:.1f} ms "
-        f"and is {gaps[fastest] - gaps[best]:.2f} nats worse."
+        else f"It takes {costs[best]:.1f} ms per image. The fastest method, {NAMES[fastest]}, takes "
+        f"{costs[fastest]:.1f} ms per image, and its distance is larger by {gaps[fastest] - gaps[best]:.2f} nats."
     )
     return (
-        f"Mean distance from the exact density in nats: {distances}. The aim was {NEAR} nats with the best method; it "
-        f"is {'reached' if gaps[best] <= NEAR else 'not reached'}. The distance of {NAMES[best]} is {parts}. {cheapest}"
+        "The distance of a method from the exact density is the mean log-likelihood of the exact density minus "
+        f"that of the method; lower is better. Over all test images, it is (in nats): {distances}. The aim was a "
+        f"distance of at most {NEAR} nats with the best method; it is "
+        f"{'reached' if gaps[best] <= NEAR else 'not reached'}. The best method is {NAMES[best]}, with the "
+        f"distance {parts}. {cheapest}"
     )
 
 
@@ -274,7 +277,7 @@ def page() -> None:
     likelihood, spread = tables(runs)
     newline = "\n"
     missing = [NAMES[method] for method in METHODS if method not in runs]
-    unmeasured = f"\nNot measured: {', '.join(missing)}.\n" if missing else ""
+    unmeasured = f"\nThese methods were not measured: {', '.join(missing)}.\n" if missing else ""
     publish(
         __file__,
         f"""# Rotations of symmetric solids, and the exact density

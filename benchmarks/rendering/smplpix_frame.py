@@ -78,11 +78,11 @@ def main() -> None:
         "| settings of the renderer | time, ms | speed ratio |\n|---|---:|---:|\n"
         + "\n".join(lines)
         + "\n\nThe first row of the table is the default setting of the renderer `smplpix`. In this run it computed "
-        f"in {fast}. The project requires at most {MOST:g} ms for an image in bfloat16: "
+        f"in {fast}. The project requires at most {MOST:g} ms for an image in bfloat16; this is "
         f"{'met' if median <= MOST else '**not met**'}. By default the renderer uses bfloat16 if the processor "
         "computes it faster than float32, and if sRGB colours of a test image then change by at most "
-        f"{255 * LARGEST_CHANGE:g}/255, and by at most {255 * MEAN_CHANGE:g}/255 on average. The changes of trained "
-        "networks are on the page [smplpix_networks](smplpix_networks.md).\n\n"
+        f"{255 * LARGEST_CHANGE:g}/255, and by at most {255 * MEAN_CHANGE:g}/255 on average. The changes of "
+        "trained networks are on the page [smplpix_networks](smplpix_networks.md).\n\n"
         f"{machine('torch', 'numba', 'numpy')} Command: `python -m benchmarks.rendering.smplpix_frame`.\n"
     )
     publish(__file__, text)

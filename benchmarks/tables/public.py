@@ -146,10 +146,11 @@ def page() -> None:
         "`tabular/classification` with the path of a CSV file and the name of a column, with gradient boosting of "
         "scikit-learn in its default settings. Both see the same rows.",
         "",
-        "Log-likelihoods are means over test rows, 15 % of a table, in nats and in the unit of the target; higher is "
-        f"better. Each is a mean over {SEEDS} random splits, with its standard error. The difference is between the "
-        f"two methods on the same split. For real targets, gradient boosting predicts a normal density with the "
-        "standard deviation of the residuals on a tenth of the training rows.",
+        "Log-likelihoods are means over the test rows (15 % of a table), in nats and in the unit of the target; higher "
+        f"is better. The table gives their mean over {SEEDS} random splits, with its standard error. The difference is "
+        "the result of the recommended start minus that of gradient boosting on the same split. For real targets, the "
+        "density of gradient boosting is a normal density around the predicted number, whose standard deviation is "
+        "that of the residuals on a tenth of the training rows.",
         "",
         "| table | data | recommended start | gradient boosting | difference | splits won |",
         "|---|---|---:|---:|---:|---:|",
@@ -173,8 +174,10 @@ def page() -> None:
         )
     lines += [
         "",
-        "If the left-out rows of a small table are perfectly separable, the temperature stops at its lower bound, and "
-        "the log says so. The probabilities are then nearly 0 and 1, and a wrong class would cost many nats.",
+        "For classes, the recommended start fits a temperature to training rows that its models left out. If the "
+        "classes of these rows are perfectly separable, as may happen with a small table, the temperature stops "
+        "at its lower bound, and the log says so. The predicted probabilities are then nearly 0 and 1, and a "
+        "wrong prediction would cost many nats.",
     ]
     command = "Command: the two lines at the top of `benchmarks/tables/public.py`."
     publish(__file__, "\n".join([*lines, "", f"{machine('torch', 'scikit-learn')} {command}", ""]))

@@ -301,18 +301,26 @@ def missed(rows: list[dict[str, Any]]) -> str:
     for name in SETS:
         own = [row for row in rows if (row["set"], row["method"]) == (name, OURS)]
         if not own:
-            texts.append(f"{name}: not measured.")
+            texts.append(f"{name} was not measured")
             continue
         reached, covered = (mean(row[key] for row in own) for key in ("log_likelihood", "coverage_90"))
         if reached < TARGETS[name]:
-            texts.append(f"{name}: the log-likelihood is {TARGETS[name] - reached:.3f} nats below its goal.")
+            texts.append(
+                f"on {name}, the log-likelihood is {TARGETS[name] - reached:.3f} nats below its goal"
+            )
         if not COVERED[0] <= covered <= COVERED[1]:
-            texts.append(f"{name}: the 90 % region covers {covered:.3f} of the test rows.")
-        for key, limit, unit in (("sweep_seconds", LONGEST, "s"), ("microseconds", SLOWEST, "µs")):
+            texts.append(
+                f"on {name}, the 90 % region covers {covered:.3f} of the test rows instead of {COVERED[0]} to "
+                f"{COVERED[1]}"
+            )
+        for key, what, limit, unit in (
+            ("sweep_seconds", "the command", LONGEST, "s"),
+            ("microseconds", "a density", SLOWEST, "µs"),
+        ):
             number = median_of(own, key)
             if number and number > limit:
-                texts.append(f"{name}: {number:.1f} {unit} instead of {limit} {unit}.")
-    return f"Goals that are not reached: {' '.join(texts)}" if texts else "All goals are reached."
+                texts.append(f"on {name}, {what} takes {number:.1f} {unit} instead of at most {limit} {unit}")
+    return f"These goals are not reached: {'; '.join(texts)}." if texts else "All goals are reached."
 
 
 def epochs_of(rows: list[dict[str, Any]]) -> str:
@@ -334,13 +342,13 @@ def page(root: Path) -> None:
         "",
         "Log-likelihoods are means over the test rows of a split, in nats and in the unit of the target; higher is "
         "better. Each number is a mean over the splits, and ± is its standard error. Splits share rows, so the "
-        "standard errors are too small; compare methods by the paired differences. The difference is ours minus the "
-        "other method on the same split. The 90 % region is the region of highest density. `MC dropout, published "
-        "per split` holds the results that the authors of the method published for each split. The peers of "
-        "scikit-learn predict a normal density with the standard deviation of the residuals on a tenth of the training "
-        "rows; NGBoost stops early on such a tenth. "
-        "`uci/ensemble` and `uci/mc_dropout` are networks of one layer with 50 units, as in the literature, trained by "
-        "this framework.",
+        "standard errors are too small; compare methods by the paired differences. The difference is the "
+        "log-likelihood of `uci/folds` (ours) minus that of the other method on the same split. The 90 % region "
+        "is the region of highest density. `MC dropout, published per split` holds the results that the authors "
+        "of the method published for each split. The methods of scikit-learn predict one number; their density is "
+        "a normal density around it, whose standard deviation is that of the residuals on a tenth of the training "
+        "rows. NGBoost uses such a tenth for early stopping. `uci/ensemble` and `uci/mc_dropout` are networks of "
+        "one layer with 50 units, as in the literature, trained by this framework.",
         "",
         "## Goals",
         "",
@@ -348,12 +356,12 @@ def page(root: Path) -> None:
         "",
         missed(rows),
         "",
-        "The worst split is the lowest mean log-likelihood of a split. The wall time is the time of one command; two "
-        "commands ran at a time, with one thread each. Other programs used the machine at the same time, so that it "
-        "is an upper "
-        "bound. The time of a prediction is the processor time of a row in a batch of 2000 rows by the frozen model on "
-        f"one thread, a median over {TIMED} splits; the last column adds the median of the density. A run trains at "
-        f"least 3000 steps and {epochs_of(rows)} epochs.",
+        "The worst split is the lowest mean log-likelihood of a split. The time of 20 runs is the wall time of "
+        "the one command that makes them; two such commands ran at a time, with one thread each. Other programs "
+        "used the machine at the same time, so that this time is an upper bound. The time of a prediction is the "
+        "processor time of a row in a batch of 2000 rows by the frozen model on one thread, a median over "
+        f"{TIMED} splits; the last column adds the median of the density. A run trains at least 3000 steps and "
+        f"{epochs_of(rows)} epochs.",
         "",
     ]
     for name in SETS:

@@ -182,20 +182,27 @@ def page() -> None:
         "This page compares uncertainty wrappers and heads of this project by error against run time, on the *real* "
         f"UCI tables concrete and yacht (standard splits {', '.join(map(str, RUNS))}) and on the *synthetic* moons "
         f"with outliers (seeds {', '.join(map(str, RUNS))}). All methods train one layer of {WIDTH} units for {STEPS} "
-        f"steps of {BATCH} samples by AdamW (learning rate {RATE:g}, weight decay {DECAY:g}), with a cosine schedule; "
-        "swag needs a constant rate. The tables have a Gaussian head unless the method is a head, and the moons a "
-        "Bernoulli head. The last weights are kept. No setting was tuned for any method. With three runs, differences "
+        f"steps of {BATCH} samples by AdamW (learning rate {RATE:g}, weight decay {DECAY:g}), with a cosine "
+        "schedule (swag: with a constant learning rate, which it needs). The weights after the last step are "
+        "tested. For the tables, the density head is `gaussian`, unless the method is itself a head: "
+        "`evidential`, `student_t`, or `balance 0.5`, which is `gaussian` trained by the β-NLL with β = 0.5. For "
+        "the moons, the head is `bernoulli`. No setting was tuned for any method. With three runs, differences "
         "below two standard errors mean nothing.",
         "",
         "![Log-likelihood against processor time](uncertainty.png)",
         "",
-        "The figure shows the mean gain over one model of the same run; the tables give standard errors. Points of one "
-        "method are the values of its knob: the number of draws of the weights or of dropout masks (1, 3, 10, 30), or "
-        "of members (1, 2, 3, 5). Times are processor times of the density and the log-likelihood of a row, in a batch "
-        f"of {ROWS} rows on one thread, as the median of {ROUNDS} repetitions; differences below a factor of two "
-        "between methods without a knob are noise. Frozen and exported models are faster.",
+        "The figure shows the gain in log-likelihood over one model without any method, as a mean over runs with "
+        "the same data; the tables give standard errors. A method has one point for each value of its knob: the "
+        "number of draws of the weights or of dropout masks (1, 3, 10, 30), or of members (1, 2, 3, 5). Times "
+        f"are processor times of the density and the log-likelihood of a row, in a batch of {ROWS} rows on one "
+        f"thread, as the median of {ROUNDS} repetitions; differences below a factor of two between methods "
+        "without a knob are noise. Frozen and exported models are faster.",
         "",
         "## Which method wins at which run time",
+        "",
+        "Each line of the list is for one data set. It names the methods in the order of their run time per row, from "
+        "the fastest on. A method is named only if its log-likelihood is higher than that of one model and of every "
+        "faster method. The gain over one model is in brackets.",
         "",
         *[winners(rows, name) for name in SETS],
     ]

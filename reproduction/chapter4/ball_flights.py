@@ -393,8 +393,9 @@ def write_results(
             *error_table(recorded), "",
             "On recorded flights, the training of the networks starts from the weights that were trained on "
             f"simulated flights. The LSTM and the hybrid are then trained for {EPOCHS['lstm']} epochs of three steps, "
-            f"the TVAE for {EPOCHS['tvae']}. The physical model estimates its constants from the training windows. "
-            "The error is measured against the recorded positions, which contain noise.", "", nearest_text, "",
+            f"and the TVAE for {EPOCHS['tvae']} such epochs. The physical model estimates its constants from the "
+            "training windows. The error is measured against the recorded positions, which contain noise.", "",
+            nearest_text, "",
         ]  # fmt: skip
     text += [
         "## Latency", "",

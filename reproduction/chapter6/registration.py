@@ -146,7 +146,8 @@ def main(runs: list[Path], scan: Path | None) -> None:
         "|---|---:|",
         *(f"| {name} | {value:.2f} |" for name, value in rows),
         "",
-        f"The aim was to encode and predict within {WANTED_MS:g} ms.",
+        f'The aim was to encode a scan and to predict its vertices ("encode and forward") within {WANTED_MS:g} '
+        "ms.",
         "",
         "## Error that the rank of the last layer makes unavoidable",
         "",

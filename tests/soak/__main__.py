@@ -255,11 +255,13 @@ def page(soak: Soak, kinds: list[Soaked]) -> str:
         [
             "# Soak test",
             "",
-            f"The test has killed {state.total} commands or processes of commands at random moments. Command: "
-            f"`python -m tests.soak {soak.count} --folder <folder>`, repeated until all kills are made. After at most "
-            "eight kills, the command is repeated and finishes.",
+            "This page says whether anything is lost or different after kills at random moments. The test has "
+            f"killed {state.total} commands, or single processes of commands. Each command was killed at most "
+            "eight times, and was then repeated without a kill until it finished. The test is made by `python -m "
+            f"tests.soak {soak.count} --folder <folder>`, which is repeated until all kills are made.",
             "",
-            f"Not killed yet: {'; '.join(missing) or 'none'}.",
+            "The test has not yet killed the following kinds of commands and processes: "
+            f"{'; '.join(missing) or 'none'}.",
             "",
             f"- *all ended*: no process of the command was alive {ALLOWED:.0f} s after the kill; the longest time is "
             "in brackets. If a job, a fork server or a worker is killed, the command goes on and starts the job "
@@ -267,8 +269,8 @@ def page(soak: Soak, kinds: list[Soaked]) -> str:
             "- *closed*: afterwards, no `run.json` has the status RUNNING.",
             "- *equal*: after the command was repeated, weights, journal, results, predictions and features equal "
             "those of the same command without a kill, to the last bit; costs are not compared.",
-            "- *the clock goes back*: Python's clock is one hour back at each start of a process, and one more hour "
-            "every 2 s.",
+            "- *the clock goes back*: in this kind of test, Python's clock is set back by one hour at each start "
+            "of a process, and by one more hour every 2 s.",
             "",
             "| killed | signal | kills | all ended | closed | equal |",
             "|---|---|---:|---:|---:|---:|",
