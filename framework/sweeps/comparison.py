@@ -25,7 +25,12 @@ DESCRIPTION, LONGEST_DESCRIPTION = "mlflow.note.content", 7500
 
 
 def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
-    """Open the parent run of a sweep's jobs in the tracking store, and return its id; None without a store."""
+    """Open the parent run of a sweep's jobs in the tracking store, and return its id; None without a store.
+
+    Args:
+        folder: Folder of the sweep.
+        config: Composed config of the first job.
+    """
     logger = config.get("logger") or {}
     if logger.get("name") != "mlflow":
         return None
@@ -132,7 +137,14 @@ def _parent(
 
 
 def close_parent(folder: Path, files: Sequence[Path], summary: str, config: Mapping[str, Any]) -> None:
-    """Log files and a description to the parent run of the sweep in `folder`, and close it; do nothing without one."""
+    """Log files and a description to the parent run of a sweep, and close the run; do nothing without a parent run.
+
+    Args:
+        folder: Folder of the sweep.
+        files: Files to log.
+        summary: Text for the description of the run; "" leaves the description unchanged.
+        config: As for `begin`.
+    """
     begun = read_run_info(folder)  # written by `begin` of this command
     if (config.get("logger") or {}).get("name") != "mlflow" or begun is None:
         return

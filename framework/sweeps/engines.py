@@ -1,7 +1,8 @@
 """Engines that start the jobs of a sweep: the interface of all engines, and the pool of processes on this machine.
 
 A job is the same on every engine: a command, a folder and a record (`framework.sweeps.jobs.Job`). An engine only starts
-it, sees it end, cancels it, and, if its jobs outlive the launcher, takes up a job that an earlier launcher has started.
+a job, notices its end, and cancels it. If its jobs outlive the launcher, a later launcher can also watch and cancel
+jobs that an earlier launcher has started.
 """
 
 import os
@@ -39,8 +40,9 @@ class Engine(Protocol):
             command: Python command of the job.
             environment: Environment variables of the job in addition to those of its machine.
             folder: Absolute path of the job's folder, whose file `CONSOLE` receives the job's output.
-            lock: Descriptor of the lock of that folder. A job with a handle acquires the lock itself after the caller
-                has recorded the handle and released the lock; any other job inherits the descriptor.
+            lock: Descriptor of the lock of that folder, which the caller holds. If the returned process has a handle,
+                the caller records the handle and releases the lock, and the job acquires the lock itself. Otherwise the
+                job inherits the descriptor.
 
         Raises:
             UserError: The engine refuses the job.
@@ -48,7 +50,7 @@ class Engine(Protocol):
         ...
 
     def close(self) -> None:
-        """Release what the engine holds in this process; the jobs have ended, or they outlive it."""
+        """Release what the engine holds in this process, after the jobs have ended; jobs that outlive it go on."""
         ...
 
 

@@ -98,7 +98,13 @@ def _send(channel: socket.socket, message: dict[str, Any]) -> None:
 
 
 def main(descriptor: str, modules: str, *target: str) -> None:
-    """Import the modules, fork the requested jobs, and run the target in each fork as Python would."""
+    """Import the modules, fork the requested jobs, and run the target in each fork as Python would.
+
+    Args:
+        descriptor: Descriptor of the socket, as text.
+        modules: Names of the modules, separated by commas.
+        target: "-m" and the name of a module, or the path of a file.
+    """
     channel = socket.socket(fileno=int(descriptor))
     _send(channel, {"ready": os.getpid()})
     for name in filter(None, modules.split(",")):

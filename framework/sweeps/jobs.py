@@ -46,9 +46,9 @@ class Job:
     The record of a job, job.json, has number, overrides, key and config as below. The record also has command, pid,
     tries, started and ended (seconds since 1970, of the last try), processor_seconds, error and status. The processor
     time covers all tries, threads and processes of the job; it is null if the sweep was killed during one of the tries.
-    A job that goes on without the sweep also has a handle, the name by which its engine knows it. The status is
-    "queued", "running", "completed", "failed" (the job exited with an error) or "died" (the job was killed, or
-    stopped by a signal).
+    A job that runs on a node of a cluster (SLURM, Ray) also has a handle, the name by which the engine knows the job.
+    The status is "queued", "running", "completed", "failed" (the job exited with an error) or "died" (the job was
+    killed, or stopped by a signal).
 
     Attributes:
         number: Number of the job in the sweep.

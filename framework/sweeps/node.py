@@ -1,7 +1,9 @@
-"""Job of a sweep on a cluster's node: it runs only if its record still names it, and writes a file about its end.
+"""Running of a sweep's job on a node of a cluster, and the file in which the node records how the job ended.
 
-The folder of the sweep is on a file system that all nodes share. A node and the launcher exchange nothing but files of
-the job's folder. The record job.json belongs to the launcher, and node.json belongs to the node.
+A job runs only if its record job.json still holds the handle by which the cluster called it: the launcher may have
+cancelled the job, or started it again. The folder of the sweep is on a file system that all nodes share. A node and the
+launcher exchange nothing but files of the job's folder: only the launcher writes job.json, and only the node writes
+node.json.
 """
 
 import json
@@ -61,7 +63,7 @@ def read_node(folder: Path, handle: str) -> dict[str, Any] | None:
 
 @dataclass
 class NodeJob:
-    """Job that a cluster calls on a node.
+    """Function object that runs a job; a cluster calls it on a node.
 
     Attributes:
         command: Python command of the job.
@@ -85,7 +87,11 @@ class NodeJob:
         self._orphaned = False
 
     def __call__(self) -> None:
-        """Run the command and write node.json, unless the job's record names another process."""
+        """Run the command and write node.json.
+
+        Raises:
+            UserError: The sweep has cancelled the job, or has started it again with another handle.
+        """
         handle, rank = self.handle, 0
         if handle is None:
             handle, rank = f"slurm:{os.environ['SLURM_JOB_ID']}", int(os.environ["SLURM_PROCID"])

@@ -29,7 +29,8 @@ class Process(Protocol):
 
     Attributes:
         seconds: Processor time of all processes of the job; None while it runs, or if its end was not observed.
-        handle: Name by which the engine knows the job, if the job goes on when this process ends; None otherwise.
+        handle: Name by which the engine knows the job, if the job runs on a node of a cluster (`node.NodeJob`) and
+            acquires the lock of its folder itself; None for a process on this machine.
         alive: Whether the engine has confirmed that the job waits or runs.
         reason: What ended the job, in the words of its engine; None if the exit code says it.
         lost: Whether the job ended because its node failed, so that it is started again.

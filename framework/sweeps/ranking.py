@@ -229,7 +229,13 @@ def write_results(folder: Path, name: str, ranking: Ranking, keys: Sequence[str]
 
 
 def close_ranking(folder: Path, summary: str, config: Mapping[str, Any]) -> None:
-    """Log the files of a search to its parent run, described by `summary`; `config` is as for `comparison.begin`."""
+    """Log the files of a search to its parent run, and close the run, as `comparison.close_parent` does.
+
+    Args:
+        folder: Folder of the search.
+        summary: Text for the description of the parent run.
+        config: Composed config of the first job.
+    """
     paths = (folder / name for name in ("ranking.csv", "best.yaml", RESULTS))
     close_parent(folder, [path for path in paths if path.is_file()], summary, config)
 

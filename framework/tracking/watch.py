@@ -44,7 +44,13 @@ def start_watcher(folder: Path) -> Iterator[None]:
 
 
 def watch(folder: Path, run: int, parent: int) -> None:
-    """Wait until the process of a run ends, and close the run if that process has not closed it."""
+    """Wait until the process of a run ends, and close the run if that process has not closed it.
+
+    Args:
+        folder: Folder of the run.
+        run: Id of the run's process, which is the parent of this process.
+        parent: Id of the process with which the run must end; 0 for none.
+    """
     orphaned_at: float | None = None
     while os.getppid() == run:
         if parent and orphaned_at is None and _parent_of(run) not in (parent, None):
