@@ -48,7 +48,7 @@ A page belongs to a command if one of the command's words begins with the key of
 it, the first of them in this order is named.
 """
 FIRST_PAGE = "docs/start/by_task.md"
-"""Page that helps after an error of any other command."""
+"""Page that helps after an error of a command to which no page in `PAGES` belongs."""
 
 
 def main() -> None:

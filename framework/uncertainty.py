@@ -220,7 +220,7 @@ class _Features:
 
 
 def remarks(predictor: Predictor) -> tuple[str, ...]:
-    """Return the remarks of the wrappers of a predictor and of fitted heads, the innermost last."""
+    """Return the remarks of the wrappers and fitted heads of a predictor, those of the innermost module last."""
     notes = (module.remark for module in predictor.modules() if isinstance(module, Uncertainty | Fitted))
     return tuple(dict.fromkeys(remark for remark in notes if remark))
 

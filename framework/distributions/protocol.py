@@ -229,7 +229,10 @@ def estimate(density: Distribution, value: Tensor) -> Estimate:
 
 
 def exact_estimate(density: Distribution, value: Tensor) -> Estimate:
-    """Return the estimate of a density whose log_prob uses no draws: `estimate.register(Mine, exact_estimate)`."""
+    """Return the log-density at `value` as an estimate without error, for a density whose log_prob uses no draws.
+
+    Such a density `Mine` registers this function by `estimate.register(Mine, exact_estimate)`.
+    """
     log_prob = density.log_prob(value)
     samples = torch.zeros(log_prob.shape, dtype=torch.int64, device=log_prob.device)
     return Estimate(log_prob, log_prob, torch.zeros_like(log_prob), samples, samples > 0)

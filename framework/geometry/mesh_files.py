@@ -285,7 +285,7 @@ def join_continued_lines(content: bytes) -> bytes:
 
 
 def statements(content: bytes, names: Sequence[bytes] = ()) -> Iterator[tuple[bytes, bytes]]:
-    """Yield the first word and the rest of each line of an OBJ or MTL file; `names` as for `text_lines`."""
+    """Yield the first word and the rest of each line of an OBJ or MTL file; `names` has its meaning in `text_lines`."""
     for line in text_lines(content, names=names):
         key, *rest = line.split(None, 1)
         yield key, rest[0].rstrip() if rest else b""

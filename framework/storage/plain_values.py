@@ -54,6 +54,12 @@ def read_json(file: Path, expected: str, remedy: str = RESTORE) -> dict[str, Any
 def read_yaml(file: Path, expected: str, remedy: str = RESTORE, error: type[UserError] = DataError) -> Any:
     """Return the values in a YAML file.
 
+    Args:
+        file: Path of the file.
+        expected: Description of the expected content, for messages.
+        remedy: Advice for a damaged file, for messages.
+        error: Class of the errors.
+
     Raises:
         error: The file is missing or damaged, or contains a tag that stands for a Python object, or an alias. With
             aliases, a few lines could mean more values than fit into any memory.

@@ -68,8 +68,8 @@ class Model:
         Args:
             inputs: an array as density.json describes it, batch dimension first; point clouds also as a list of arrays
                 of different lengths. Rows of NaN at the end of a cloud are padding.
-            seed: seed of the random numbers of a model that draws some. They are the same for all inputs, so that a
-                prediction does not depend on the other inputs.
+            seed: seed of the random numbers of a model that draws some. These numbers are the same for all inputs, so
+                that a prediction does not depend on the other inputs.
 
         Raises:
             ValueError: the inputs have another shape than density.json says, or a number is not finite.

@@ -24,7 +24,7 @@ from numpy.lib import format as npy
 from framework.deployment.exported_folder.predict import Model, load
 
 MOST_BYTES = 64 * 2**20
-"""Largest size of a request."""
+"""Largest size of a request, bytes."""
 MOST_ROWS = 10_000
 """Largest number of inputs in a request."""
 LARGE = 2**15

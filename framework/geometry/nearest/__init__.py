@@ -252,7 +252,7 @@ def refuse_bad(points: Tensor, sizes: Tensor | None, name: str) -> None:
 def on_processor(
     clouds: Tensor, queries: Tensor | Queries, sizes: Tensor | None, query_sizes: Tensor | None
 ) -> Nearest:
-    """Return the nearest points, found by the compiled kernels of the CPU; arguments as for `nearest`."""
+    """Return the nearest points, found by the compiled kernels of the CPU; the arguments are those of `nearest`."""
     from framework.geometry.nearest import processor
 
     shared = isinstance(queries, Queries)
@@ -287,7 +287,10 @@ def on_processor(
 
 
 def on_device(clouds: Tensor, points: Tensor, sizes: Tensor | None, query_sizes: Tensor | None) -> Nearest:
-    """Return the nearest points, found by torch on devices other than the CPU; arguments as for `nearest`."""
+    """Return the nearest points, found by torch on devices other than the CPU.
+
+    The arguments are those of `nearest`; `points` are the coordinates of the queries.
+    """
     from framework.geometry.nearest.device import nearest_of
 
     refuse_bad(clouds, sizes, "clouds")
