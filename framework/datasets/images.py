@@ -41,7 +41,7 @@ MODES = {1: "L", 3: "RGB", 4: "RGBA"}
 STRIP = 256
 """Number of pixel rows of an image that are converted at a time."""
 IN_MEMORY = 2 * 2**30
-"""Largest total size, in bytes, of decoded crops that are kept in memory; more crops are decoded when they are needed."""
+"""Largest total size, in bytes, of decoded crops that are kept in memory; more crops are decoded when needed."""
 
 Box = tuple[float, float, float, float]
 """Left, top, right and bottom in pixels, measured from the outer corner: (0, 0, width, height) is the whole image."""
