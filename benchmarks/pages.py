@@ -12,6 +12,11 @@ from framework.datasets.csv_columns import read_columns
 
 
 def machine(*packages: str) -> str:
+    """Return a sentence on where and when a page was measured: see `environment`."""
+    return f"Measured on {environment(*packages)}"
+
+
+def environment(*packages: str) -> str:
     """Return one line with the processor, the date and the versions of Python and of these packages."""
     processor = platform.processor() or "unknown processor"
     cpuinfo = Path("/proc/cpuinfo")

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.commands import ROOT, carry_out
-from benchmarks.pages import machine
+from benchmarks.pages import environment, machine
 from benchmarks.sweeps import processor_seconds, record, wall_seconds
 from framework.reports.table import NOT_AVAILABLE, format_number
 
@@ -382,7 +382,7 @@ def machine_and_day(jobs: Sequence[Mapping[str, Any]]) -> str:
     if not jobs:
         return NOT_AVAILABLE
     day = datetime.date.fromtimestamp(max(job["ended"] for job in jobs))
-    return f"{machine().partition(';')[0]}; {day.isoformat()}"
+    return f"{environment().partition(';')[0]}; {day.isoformat()}"
 
 
 def link(script: str) -> str:

@@ -299,7 +299,7 @@ def test_a_group_of_one_run_keeps_its_standard_error() -> None:
     assert "1.00 ± 0.04" in markdown([row], {"method": "method", "error": "error"})
     both = [row, {"method": "b", "error": 2.0, "error_std": 0.03}]
     text = markdown(both, {"method": "method", "error": "error"})
-    assert "± standard deviation over runs; of a single run standard error of the mean" in text
+    assert "± standard deviation over runs; for a single run: standard error of the mean" in text
 
 
 def test_aggregate_never_averages_what_is_lacking_or_infinite_away() -> None:

@@ -355,7 +355,7 @@ def _caption(rows: Sequence[Row], columns: Mapping[str, str], lines: Sequence[Se
     ]
     bold = any(cell.spans for line in lines[1:] for cell in line)
     return "; ".join(
-        [f"± {'; of a single run '.join(spreads)}"] * bool(spreads) + [f"bold: best, {RULE}"] * bold
+        [f"± {'; for a single run: '.join(spreads)}"] * bool(spreads) + [f"bold: best, {RULE}"] * bold
     )
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 
 import framework
-from benchmarks.pages import machine, read_rows
+from benchmarks.pages import environment, read_rows
 from framework.configuration.schema import build, resolve
 from framework.datasets.fields import as_batch
 from framework.evaluation.tradeoff import rows, tradeoff
@@ -73,7 +73,7 @@ def main() -> None:
             seed=0,
             repeats=5 if knob == "samples" else 1,
         )
-    machine_line = f"{machine('torch').rstrip('.')}; batches of 500, one thread"
+    machine_line = f"{environment('torch').rstrip('.')}; batches of 500, one thread"
     measurements = [
         {**row, "machine": machine_line}
         for row in rows(curves, dict.fromkeys(LABELS, "lower"), synthetic=True)

@@ -207,7 +207,7 @@ def main() -> None:
         "- **Processor minutes per run** are a mean over all classes of Table 3.3.\n\n"
         + "\n".join(lines)
         + "\n\n"
-        f"{runs} runs. {machine('torch', 'pytorch-lightning')}\n"
+        f"The table summarises {runs} runs. {machine('torch', 'pytorch-lightning')}\n"
     )
     publish(__file__, text)
 

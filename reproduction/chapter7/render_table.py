@@ -127,8 +127,8 @@ def page(rows: Mapping[tuple[str, str], Mapping[str, Any]]) -> str:
     command = f"python -m framework -m {' '.join(SWEEP)}"
     lines += [
         "",
-        f"Measured on {first['device']}, {first['threads']} thread. {machine('torch', 'numpy')} Command: "
-        f"`python -m reproduction.chapter7.render_table`, which runs `{command}`.",
+        f"The images were drawn on {first['device']} with {first['threads']} thread. {machine('torch', 'numpy')} "
+        f"Command: `python -m reproduction.chapter7.render_table`, which runs `{command}`.",
     ]
     return "\n".join(lines)
 

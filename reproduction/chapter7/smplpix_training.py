@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from benchmarks.commands import ROOT, carry_out
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import environment, write_page
 from framework.configuration.loading import load, load_with_description, reader
 from framework.figures.style import GREEN, GREY, RED, titled_figure
 from reproduction.chapter7 import smplpix_table as table
@@ -161,7 +161,7 @@ def read_runs(method: Method, epochs: int) -> Row | None:
             key: float(np.std(numbers, ddof=1)) if len(numbers) > 1 else float("nan")
             for key, numbers in values.items()
         },
-        machine("torch", "numpy"),
+        environment("torch", "numpy"),
     )
 
 
@@ -322,7 +322,7 @@ def report(rows: Record) -> str:
                 if other_machines
                 else []
             ),
-            f"{usual_machine} Command: `python -m reproduction.chapter7.smplpix_training"
+            f"Measured on {usual_machine} Command: `python -m reproduction.chapter7.smplpix_training"
             f"{' --skins <folder>' if skins else ''}{' --there' if missing else ''}`.",
             "",
         ]
