@@ -289,8 +289,9 @@ def require_normalised(
         by: name of the caller, for the message.
 
     Raises:
-        DataError: half of a cloud's points are farther than 2 · `reach` from the origin (fewer may be outliers that a
-            robust normalisation left there), or all are nearer than 0.01 · `reach`, but not all at the origin.
+        DataError: more than half of a cloud's points are farther than 2 · `reach` from the origin; fewer such points
+            may be outliers, which a robust normalisation leaves there. Or all points are nearer than 0.01 · `reach`,
+            and not all of them are at the origin.
     """
     if torch.compiler.is_exporting():  # a trace depends on no value
         return

@@ -158,7 +158,7 @@ class Angle(PlainDensity):
         joint: the density of all three angles; it draws the samples and gives the mode and the dtype.
         index: 0 for azimuth, 1 for elevation, 2 for tilt.
         frame: the matrix Fisher density, with fields of shapes (*batch, …), or the components of a mixture, with fields
-            of shapes (*batch, component, …) whose component dimension may be 1 if all components share the field.
+            of shapes (*batch, component, …). The component dimension of a field can be 1 if all components share it.
         log_weights: log-weights of the components, (*batch, component), nats; None for a single density.
     """
 

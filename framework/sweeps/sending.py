@@ -23,9 +23,9 @@ log = logging.getLogger(__name__)
 class JournalSender:
     """Object that sends, in a thread, what ended jobs have not sent to the store themselves.
 
-    If the store does not accept the journal of a job, the thread tries again until the `with` block of this object
-    ends, and from then on until the store has accepted nothing for `PATIENCE` seconds. A warning then names the command
-    that sends the rest.
+    If the store does not accept the journal of a job, the thread tries again. After the end of the `with` block of this
+    object, the thread gives up when the store has accepted nothing for `PATIENCE` seconds. A warning then names the
+    command that sends the rest.
 
     Args:
         store: Address of the tracking store that the command names.

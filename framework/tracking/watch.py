@@ -1,7 +1,8 @@
 """Small process that closes a run after the run's own process was killed.
 
-The arguments of this program are the run folder, the id of the run's process, and the id of the parent process with
-which the run must end (for a job, the process of its sweep), or 0 if there is none. The program ends with the run.
+The program has three arguments: the run folder, the id of the run's process, and the id of the process with which the
+run must end. For a job, that is the process of its sweep; it is 0 if there is no such process. The program ends with
+the run.
 """
 
 import os
