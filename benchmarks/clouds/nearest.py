@@ -294,10 +294,11 @@ def report() -> str:
             "compares the run time of the project's exact search (`ours`) with five exact searches of public "
             "libraries. It is written by `python -m benchmarks.clouds.nearest`.",
             "",
-            "The methods search the nearest points in clouds of n points in float32. The shapes of the clouds are "
-            f"{', '.join(samplers())}. The clouds of `scan` are points of a real scan, resampled with jitter; the "
-            "other shapes are synthetic. The k basis points are uniform in the unit ball. A measured call builds the "
-            "search structure of a cloud and computes the k distances and the k difference vectors.",
+            "The methods search the nearest points in clouds of n points in float32. The clouds have these "
+            f"shapes: {', '.join(samplers())}. The clouds of `scan` are points of a real scan, resampled with "
+            "jitter; the other shapes are synthetic. The k basis points are uniform in the unit ball. A measured "
+            "call builds the search structure of a cloud and computes the k distances and the k difference "
+            "vectors.",
             "",
             "The table gives the processor time, in milliseconds per cloud, to find the nearest point of the cloud "
             "to each basis point on one core. Each number is the shortest time of several rounds; every round calls "

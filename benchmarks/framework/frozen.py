@@ -189,8 +189,9 @@ def main() -> None:
         f"{ROUNDS} rounds, with the smallest and the largest one in brackets, and each round contributes its shortest "
         "call. In a round the forms of the classifier run one after the other. `ms a sample` is this time divided by "
         "the batch size. `speed ratio` says how many times as fast the form is as the PyTorch model in the first row "
-        "with the same task and batch size. `of the best` is the time divided by the time of the fastest form other "
-        f"than `frozen`; the project requires at most {MOST} of `frozen` in the rows `classify`.\n\n"
+        "with the same task and batch size. `of the best` is the time divided by the time of the fastest form "
+        f"other than `frozen`. In the rows `classify`, the project requires that this ratio is at most {MOST} for "
+        "`frozen`.\n\n"
         "| task | batch size | form | ms a call | ms a sample | speed ratio | of the best |\n"
         "|---|---|---|---|---|---|---|\n"
         + "\n".join(lines)

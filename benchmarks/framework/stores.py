@@ -87,9 +87,9 @@ class Sweep:
             time.sleep(0.2)
         running = sum(_status(job) == "RUNNING" for job in self.jobs)
         return (
-            f"after {time.monotonic() - self.begun:.0f} s. By then each job had sent {LINES} lines or more, all jobs "
-            f"together {sum(map(_sent, self.jobs)):,} lines, and {running} of the {RUNS} jobs were still training or "
-            "testing their model"
+            f"after {time.monotonic() - self.begun:.0f} s. By then each job had sent {LINES} lines of its journal "
+            f"or more, all jobs together {sum(map(_sent, self.jobs)):,} lines, and {running} of the {RUNS} jobs "
+            "were still training or testing their model"
         )
 
     def finish(self) -> float:

@@ -265,7 +265,8 @@ def page(soak: Soak, kinds: list[Soaked]) -> str:
             "",
             f"- *all ended*: no process of the command was alive {ALLOWED:.0f} s after the kill; the longest time is "
             "in brackets. If a job, a fork server or a worker is killed, the command goes on and starts the job "
-            "again. Jobs on SLURM go on without their launcher, and the next command takes them up again.",
+            "again. Jobs on SLURM go on without the command that has submitted them, and the repeated command "
+            "takes them up again.",
             "- *closed*: afterwards, no `run.json` has the status RUNNING.",
             "- *equal*: after the command was repeated, weights, journal, results, predictions and features equal "
             "those of the same command without a kill, to the last bit; costs are not compared.",
