@@ -17,7 +17,7 @@ class SyncOptions(Options):
 
 
 def run(config: Config) -> None:
-    """Send the journal of the run in `mode.run` and those of a sweep's jobs, and print the number of lines sent.
+    """Send the journals of the run or the sweep in the folder `mode.run`, and print the number of lines sent.
 
     Raises:
         ConfigError: There is no run.

@@ -85,6 +85,8 @@ def _read_header(
 def to_real(values: object, name: str) -> NDArray:
     """Return an array as float64; complex numbers are accepted if every imaginary part is zero.
 
+    `name` is the name of the array in messages.
+
     Raises:
         ValueError: A number has an imaginary part, which a cast would drop silently.
     """

@@ -29,7 +29,7 @@ SECONDS = 1.5
 
 
 def prepared(name: str, **config: Any) -> Any:
-    """Return the prepared data set of this name."""
+    """Return the prepared data set of the plugin `name`, built with the parameters `config`."""
     data = build("data", resolve("data", {"name": name, **config}))
     data.prepare()
     return data

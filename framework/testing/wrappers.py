@@ -113,7 +113,7 @@ def _compare_on_grid(density: Distribution, worst: Worst) -> None:
 
 
 def batches(row: WrapperRow) -> list[Batch]:
-    """Return a validation set of 40 samples as batches."""
+    """Return 40 validation samples for the wrapper of a contract row, as batches."""
     target = values(row.target, (40,))
     parts = zip(inputs(40).split(16), target.split(16), strict=True)
     return [{"input": batch_inputs, "target": target_values} for batch_inputs, target_values in parts]

@@ -276,7 +276,7 @@ KEPT = 2**20
 
 
 class Desks(local):
-    """Working memory of each thread, kept between searches, because allocating it takes a large share of their time."""
+    """Working memory of each thread, kept between searches, because its allocation takes a large part of their time."""
 
     def __init__(self) -> None:
         self.cached: dict[tuple[int, int, np.dtype, int], tuple[Bench, Packed, Packed]] = {}
