@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from numpy.random import Generator
 from pydantic import Field
 
+from framework.errors import ConfigError
 from framework.geometry.meshes import Mesh, normals, sample
 
 Kind = Literal["whole", "partial", "outliers"]
@@ -39,15 +40,23 @@ class Scanner:
 class Kinds:
     """Shares of two kinds of scans; the remaining scans are complete.
 
-    If the two shares add up to more than 1, both are divided by their sum.
-
     Attributes:
         partial: share of the scans with missing parts.
         outliers: share of the scans with points of other objects.
+
+    Raises:
+        ConfigError: the two shares add up to more than 1.
     """
 
     partial: Share = 0.2
     outliers: Share = 0.2
+
+    def __post_init__(self) -> None:
+        if self.partial + self.outliers > 1 + 1e-9:  # two decimal numbers may round to a little more than 1
+            raise ConfigError(
+                f"data.partial = {self.partial} and data.outliers = {self.outliers} add up to "
+                f"{self.partial + self.outliers:g}, but each scan has one kind. Give shares that add up to at most 1."
+            )
 
     def shares(self) -> Float[np.ndarray, "kind"]:
         """Return the share of each kind of scan; their sum is 1."""

@@ -149,6 +149,12 @@ def test_a_config_out_of_range_is_refused(name, key, value):
         resolve("data", {"name": name, key: value})
 
 
+def test_shares_of_kinds_that_add_up_to_more_than_one_are_refused(file):
+    with pytest.raises(ConfigError, match=r"data.partial = 0.9 and data.outliers = 0.2 add up to 1.1"):
+        data(file, partial=0.9)
+    data(file, partial=0.9, outliers=0.1)
+
+
 def test_a_result_is_one_coloured_ply(tmp_path):
     content = doll()
     cloud = np.random.default_rng(0).normal(size=(50, 3))
