@@ -167,11 +167,12 @@ def page() -> None:
         "",
         "This page compares scores that should be high for inputs unlike the training data. `entropy` and `confidence` "
         "are computed from the predicted density, and all others from the features that the final layer reads "
-        "(`uncertainty=[feature_score]`). AUROC is the probability that a random outlier has a higher score than a "
-        "random test sample; FPR95 is the share of test samples that a threshold classifies as outliers if it detects "
-        f"95 % of the outliers. The numbers are means over {len(SEEDS)} seeds of the training and of the data "
-        "(for digits, of their split), and ± is the standard deviation over seeds. Settings are the defaults of "
-        "`feature_score`, except where the name of the score says otherwise; none was tuned.",
+        "(`uncertainty=[feature_score]`). AUROC is the probability that a random outlier has a higher score than "
+        "a random test sample; 1 is best. FPR95 is the share of test samples that a threshold classifies as "
+        f"outliers if it detects 95 % of the outliers; 0 is best. The numbers are means over {len(SEEDS)} seeds "
+        "of the training and of the data (for digits, of their split), and ± is the standard deviation over "
+        "seeds. The settings are the defaults of `feature_score`, except where the name of the score says "
+        "otherwise. No setting was tuned.",
     ]
     for data, heading in (
         ("moons", "Moons (synthetic)"),

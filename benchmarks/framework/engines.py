@@ -180,8 +180,9 @@ def main() -> None:
             "|---|---:|---:|---:|---:|---:|",
             *lines,
             "",
-            f"Installed size: submitit {installed_megabytes('submitit'):.1f} MB, Ray "
-            f"{installed_megabytes('ray'):.0f} MB, each without its dependencies; the pool needs no package.",
+            f"The installed packages take {installed_megabytes('submitit'):.1f} MB (submitit) and "
+            f"{installed_megabytes('ray'):.0f} MB (Ray) on disk, without their dependencies. The pool needs no "
+            "package.",
             "",
             f"{machine('hydra-core', 'submitit', 'ray')[:-1]}, SLURM {slurm_version}. "
             "Command: `python -m benchmarks.framework.engines`.",

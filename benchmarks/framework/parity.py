@@ -188,10 +188,10 @@ def write(lines: Sequence[Mapping[str, str]]) -> None:
         "ones. The export itself makes the comparison, and writes nothing if a difference is too large "
         "([docs/export.md](../../docs/export.md)).",
         "",
-        f"The {len(lines)} models have random weights. Of them, {len(exported)} are exported, with "
-        f"{len(pairs)} pairs of an encoder and a density head, and {len(refused)} are refused. "
-        f"{' and '.join(WITHOUT_PAIRS)} is exported with one density head only. The parameters of the "
-        f"densities differ by at most {worst['random']:.1e} for random inputs and {worst['extreme']:.1e} for extreme "
+        f"The comparison has {len(lines)} models with random weights. Of these, {len(exported)} are exported, "
+        f"with {len(pairs)} pairs of an encoder and a density head, and {len(refused)} are refused. "
+        f"{' and '.join(WITHOUT_PAIRS)} is exported with one density head only. The parameters of the densities "
+        f"differ by at most {worst['random']:.1e} for random inputs and {worst['extreme']:.1e} for extreme "
         "inputs, as a share of the largest number in a row; 1e-5 is allowed. Log-densities differ by at most "
         f"{worst['log-density']:.1e} for random inputs, as a share of max(1, |log-density|); 1e-4 is allowed.",
         "",
@@ -207,8 +207,8 @@ def write(lines: Sequence[Mapping[str, str]]) -> None:
         "",
         "## Exported models",
         "",
-        "Each encoder and density head is shown with the largest difference of its rows and pairs. "
-        "[parity.csv](parity.csv) holds every model.",
+        "The table has a row for each encoder and for each density head. A difference is the largest one over all "
+        "models that contain this encoder or head. [parity.csv](parity.csv) holds every model.",
         "",
         "| encoder | density heads | models | random | extreme |",
         "|---|---|---|---|---|",

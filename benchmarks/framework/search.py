@@ -232,11 +232,12 @@ def introduction() -> Sequence[str]:
     return [
         "# Search for a Pareto front, compared with grids",
         "",
-        "Does a search with NSGA-II (`hydra/sweeper=optuna hydra.sweeper.sampler=nsga2`) over error and run time find "
-        f"a front that no grid of the same number of trials dominates? Each run has {TRIALS} trials of a small "
-        "network. They differ in the widths of its layers, the learning rate and the dropout rate. The searches choose "
-        f"them from `{' '.join(SPACE)}`. The grids have {len(WIDTHS)} or {len(WIDTHS[::2])} widths, {len(RATES)} "
-        "learning rates and one or two dropout rates (0; 0 and 0.25).",
+        "This page shows whether a search over error and run time with NSGA-II (`hydra/sweeper=optuna "
+        "hydra.sweeper.sampler=nsga2`) finds a Pareto front that no grid of the same number of trials dominates. "
+        f"Each run has {TRIALS} trials of a small network. They differ in the widths of its layers, the learning "
+        f"rate and the dropout rate. The searches choose them from `{' '.join(SPACE)}`. The grids have "
+        f"{len(WIDTHS)} or {len(WIDTHS[::2])} widths, {len(RATES)} learning rates and one or two dropout rates "
+        "(0; 0 and 0.25).",
         "",
         "The error is the best validation loss. The run time is the number of milliseconds per sample on one "
         "thread. A single measurement varies by more than 5 %, because another trial runs at the same time. The "

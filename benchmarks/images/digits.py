@@ -287,8 +287,11 @@ to 32 × 32 pixels and split at random into 7,000 for training, 1,500 for valida
 ## Turns of 0, 1 and 8
 
 Each image is turned by a random angle, and the model predicts this angle (`data=turned_images`). A 0, 1 or 8 looks
-nearly the same after half a turn, so that a density with one peak must be wide or wrong. The numbers are means over
-{len(SEEDS)} seeds of the training, with their standard deviation. Higher is better.
+nearly the same after half a turn, so that a density with one peak must be wide or wrong. The table gives mean
+log-likelihoods of the angle, for all test images and for each digit; higher is better. They are means over {
+            len(SEEDS)
+        }
+seeds of the training, with their standard deviation.
 
 {newline.join(likelihoods)}
 
