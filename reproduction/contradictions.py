@@ -158,12 +158,12 @@ PARTS = (
         VIEWS,
     ),
     Part(
-        "The thesis says that CVAE, whose distribution of the latent variable depends on the image, is better "
-        "than sCVAE, where it does not. In our results, sCVAE is better for dining tables, which look the same "
-        "after a rotation by 180°. The suspected cause is that CVAE is trained for too few epochs. The test of "
-        "this cause trains both methods for twice as many epochs. Each image of a dining table has two true "
-        "azimuths. The last column of results is the smaller of the two probabilities that the model gives to "
-        "within 45° of either true azimuth; 0.5 is best.",
+        "The thesis says that CVAE is better than sCVAE. In CVAE the distribution of the latent variable depends "
+        "on the image, and in sCVAE it does not. In our results, sCVAE is better for dining tables, which look "
+        "the same after a rotation by 180°. The suspected cause is that CVAE is trained for too few epochs. The "
+        "test of this cause trains both methods for twice as many epochs. Each image of a dining table has two "
+        "true azimuths. The last column of results is the smaller of the two probabilities that the model gives "
+        "to within 45° of either true azimuth; 0.5 is best.",
         "3-27",
         "tables",
         ("experiment=pascal3d/cvae,pascal3d/scvae", "data.category=diningtable", LONGER, "seed=0,1,2"),

@@ -199,7 +199,7 @@ START_TEXT = {
 little else: `predict` predicts two rows of a table, and `encode` encodes one point cloud. The first two rows of the
 results are lower bounds: PyTorch alone, and a script that only loads the model. The project wants at most 2.3 s of
 processor time for each of the two commands. `encode` takes longer: the normalisation of clouds is compiled code, which
-needs numba, and the import of numba with its parts of SciPy takes the rest.
+needs numba, and the import of numba, with the parts of SciPy that numba needs, takes the rest.
 """,
     "training": """This section measures how long training and testing take to start. `train` (`mode=train`) trains a
 small network for three epochs on 2,000 rows of a table and tests it, and `test` (`mode=test`) tests it on 300 rows.
