@@ -59,6 +59,7 @@ REFUSED_ENCODERS = {
     "points": "random choice of points|order of the farthest points",
     "pointnet2": "order of the farthest points",
     "point_nn": "order of the farthest points",
+    "dgcnn": "search for nearest neighbours",
     "projection": "Its part Projection is not a sequence of operations",
     "rasterised": "Its part Rasterised is not a sequence of operations|does not accept the random inputs",
     "ballistic": "Its part BallisticEncoder is not a sequence of operations|does not accept the random inputs",

@@ -175,7 +175,7 @@ def test_what_is_no_chain_of_layers_is_left_to_onnx_runtime_or_torch(kind, form_
     assert not form.density(torch.randn(5, 4)).logits.requires_grad
 
 
-@pytest.mark.parametrize("name", ["pointnet", "pointnet2", "deepsets"])
+@pytest.mark.parametrize("name", ["pointnet", "pointnet2", "deepsets", "dgcnn"])
 def test_clouds_of_different_sizes_go_through_torch(name):
     shape = (30, 3)
     encoder = build("encoder", resolve("encoder", name), input_shape=shape)

@@ -1,17 +1,21 @@
-"""The layers that PointNet and PointNet++ are made of."""
+"""The layers that PointNet, PointNet++ and DGCNN are made of."""
 
 from collections.abc import Sequence
 
 from torch import nn
 
 
-def layers(length: int, widths: Sequence[int]) -> nn.Sequential:
+def layers(length: int, widths: Sequence[int], slope: float = 0.0) -> nn.Sequential:
     """Return for each width a linear layer without bias, batch norm (which has a bias) and ReLU.
 
-    `length` is the number of inputs of the first layer.
+    Args:
+        length: number of inputs of the first layer.
+        widths: number of outputs of each layer.
+        slope: slope of the activation for negative numbers; it is LeakyReLU if the slope is not 0.
     """
     modules: list[nn.Module] = []
     for width in widths:
-        modules += [nn.Linear(length, width, bias=False), nn.BatchNorm1d(width), nn.ReLU(inplace=True)]
+        activation = nn.LeakyReLU(slope, inplace=True) if slope else nn.ReLU(inplace=True)
+        modules += [nn.Linear(length, width, bias=False), nn.BatchNorm1d(width), activation]
         length = width
     return nn.Sequential(*modules)

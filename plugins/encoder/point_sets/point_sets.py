@@ -1,4 +1,4 @@
-"""Base class of networks on clouds, functions that concatenate the points of a batch, and maxima over each cloud."""
+"""Base class of networks on clouds, and functions that concatenate points and take maxima and means over clouds."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -138,6 +138,17 @@ def largest(
     if all_have(counts, len(values) // count):
         return values.unflatten(0, (count, -1)).amax(1)
     return torch.stack([part.amax(0) for part in values.split(counts.tolist())])
+
+
+def mean(
+    values: Float[Tensor, "point channels"], counts: Int[Tensor, "batch"]
+) -> Float[Tensor, "batch channels"]:
+    """Return the mean of each channel over the points of each cloud; every cloud has at least one point."""
+    if len(counts) == 0:
+        return values.new_zeros(0, values.shape[1])
+    if all_have(counts, len(values) // len(counts)):
+        return values.unflatten(0, (len(counts), -1)).mean(1)
+    return torch.stack([part.mean(0) for part in values.split(counts.tolist())])
 
 
 def first_rows(counts: Int[Tensor, "batch"], most: int) -> Int[Tensor, "found"]:

@@ -28,6 +28,7 @@ def rows(first: CloudRow, second: CloudRow) -> tuple[CloudRow, ...]:
 
 NET = {"point_widths": [8, 8, 8, 12], "widths": [12, 8]}
 BALLS = {"width": 0.125, "centroids": [20, 6], "radius": 0.4}
+EDGES = {"neighbours": 6, "edge_widths": [8, 12], "point_width": 16, "widths": [12, 8]}
 SETS = {"channels": [12, 12], "widths": [8]}
 ROWS = {
     "pointnet": rows(
@@ -48,6 +49,10 @@ ROWS = {
                 "finite on extreme inputs": "clouds that were not normalised are refused",
             },
         ),
+    ),
+    "dgcnn": rows(
+        CloudRow("one edge convolution", (40, 3), config={**EDGES, "edge_widths": [8]}),
+        CloudRow("two edge convolutions", (40, 3), config=EDGES),
     ),
     "deepsets": rows(
         CloudRow("elu", (40, 3), config={**SETS, "activation": "elu"}), CloudRow("tanh", (40, 3), config=SETS)

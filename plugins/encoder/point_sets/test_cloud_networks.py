@@ -8,16 +8,17 @@ import torch
 from framework.configuration.schema import resolve
 from framework.errors import ConfigError
 from framework.geometry.clouds import pad
-from plugins.encoder.point_sets import test_deepsets, test_pointnet, test_pointnet2
+from plugins.encoder.point_sets import test_deepsets, test_dgcnn, test_pointnet, test_pointnet2
 
 BUILDERS = {
     "deepsets": test_deepsets.build_encoder,
+    "dgcnn": test_dgcnn.build_encoder,
     "pointnet": test_pointnet.build_encoder,
     "pointnet2": test_pointnet2.build_encoder,
 }
 
 
-@pytest.mark.parametrize("name", ["pointnet", "pointnet2"])
+@pytest.mark.parametrize("name", ["pointnet", "pointnet2", "dgcnn"])
 def test_padding_does_not_enter_the_moments_of_batch_norm(name):
     clouds = [torch.randn(number, 3) for number in (9, 9, 9)]
     encoder, other = BUILDERS[name](), BUILDERS[name]()
@@ -32,6 +33,7 @@ def test_padding_does_not_enter_the_moments_of_batch_norm(name):
     [
         ("pointnet", {}, (3000, 2000, 2100, 10, 2999)),
         ("pointnet2", {"grouping": "multi_scale"}, (300, 20, 21, 10, 299)),
+        ("dgcnn", {}, (700, 20, 21, 10, 699)),
     ],
 )
 def test_few_clouds_at_a_time_give_what_all_at_once_give(name, config, numbers):
@@ -57,6 +59,10 @@ def test_refuses_attributes_that_are_not_there(name):
         *(
             ("pointnet", config)
             for config in ({"point_widths": [4, 4]}, {"widths": []}, {"variant": "plain"})
+        ),
+        *(
+            ("dgcnn", config)
+            for config in ({"neighbours": 0}, {"edge_widths": []}, {"point_width": 0}, {"widths": []})
         ),
         *(
             ("pointnet2", config)

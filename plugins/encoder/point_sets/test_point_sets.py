@@ -12,6 +12,7 @@ from plugins.encoder.point_sets.point_sets import (
     encode_in_parts,
     first_rows,
     largest,
+    mean,
     repeat_for_points,
 )
 
@@ -27,7 +28,7 @@ def test_points_are_those_of_each_cloud_in_order(numbers, most):
 
 
 @pytest.mark.parametrize("numbers", [(4, 4, 4), (4, 2, 1), (1,), ()])
-def test_the_largest_of_each_channel(numbers):
+def test_the_largest_and_the_mean_of_each_channel(numbers):
     parts = [torch.randn(number, 3) - 5 for number in numbers]
     values = torch.cat([torch.zeros(0, 3), *parts]).requires_grad_()
     counts = torch.tensor(numbers, dtype=torch.int64)
@@ -35,6 +36,9 @@ def test_the_largest_of_each_channel(numbers):
     assert maxima.shape == (len(numbers), 3)
     for row, part in zip(maxima, parts, strict=True):
         assert torch.equal(row, part.max(0).values)
+    for row, part in zip(mean(values, counts), parts, strict=True):
+        torch.testing.assert_close(row, part.mean(0))
+    assert mean(values, counts).shape == (len(numbers), 3)
     spread = repeat_for_points(maxima, counts)
     assert spread.shape == values.shape
     assert (spread >= values).all()

@@ -28,7 +28,7 @@ def build_encoder(shape=(150, 3), **config):
 
 
 def apply_layers(layers, numbers):
-    """Return numbers after linear layers, batch norm with the running moments, and ReLU, in NumPy."""
+    """Return numbers after linear layers, batch norm with the running moments, and (leaky) ReLU, in NumPy."""
     for layer in layers:
         state = {name: value.double().numpy() for name, value in layer.state_dict().items()}
         if isinstance(layer, torch.nn.Linear):
@@ -38,6 +38,8 @@ def apply_layers(layers, numbers):
             numbers = numbers * state["weight"] + state["bias"]
         elif isinstance(layer, torch.nn.ReLU):
             numbers = np.maximum(numbers, 0)
+        elif isinstance(layer, torch.nn.LeakyReLU):
+            numbers = np.where(numbers > 0, numbers, layer.negative_slope * numbers)
     return numbers
 
 
