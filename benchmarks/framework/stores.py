@@ -136,8 +136,9 @@ def measure_outage(server: StoreServer) -> list[str]:
         again = sweep.count_logs("can be reached again after")
     return [
         f"{sweep.text()} trained {RUNS} models at the same time, in {seconds:.0f} s. The server was killed {reached}. "
-        f"It was started again {AWAY:.0f} s later, when {running} jobs were still running; {again} jobs printed that "
-        "the store could be reached again. After the end of the command, the journals were compared with the store:",
+        f"The server was started again {AWAY:.0f} s later, when {running} jobs were still running; {again} jobs "
+        "printed that the store could be reached again. After the end of the command, the journals were compared with "
+        "the store:",
         "",
         *TABLE,
         *rows(counts),
@@ -163,10 +164,11 @@ def measure_loss(server: StoreServer) -> list[str]:
     if last != after:
         raise RuntimeError(f"the second mode=sync has changed the store: {after} became {last}")
     return [
-        f"{sweep.text()} ran for {seconds:.0f} s. The server was killed {reached}. It was started again after the end "
-        f"of the command; the store lacked {before.lost:,} numbers and {before.files_lost} files. Then `python -m "
-        f"framework mode=sync mode.run=<folder of the sweep>` sent {sent:,} lines in {duration:.0f} s. Repeated, "
-        f"it sent {again} lines and changed nothing. The journals were compared with the store:",
+        f"{sweep.text()} ran for {seconds:.0f} s. The server was killed {reached}. The server was started again "
+        f"after the end of the command; the store lacked {before.lost:,} numbers and {before.files_lost} files. "
+        f"Then `python -m framework mode=sync mode.run=<folder of the sweep>` sent {sent:,} lines in "
+        f"{duration:.0f} s. Repeated, it sent {again} lines and changed nothing. The journals were compared with "
+        "the store:",
         "",
         *TABLE,
         *rows(after),

@@ -78,9 +78,9 @@ def report() -> str:
             "This page measures the peak memory that the renderer `rasterizer` needs for one image and its gradient.",
             "",
             f"The image whose memory is measured (`color`, {HEIGHT} × {WIDTH} pixels) shows a synthetic body of "
-            "27,554 vertices. The gradient is with respect to vertices and vertex colours. The image is the first "
-            "one of its renderer. Each row is measured in a new process that has drawn a small image before, so that "
-            "all code is compiled.",
+            "27,554 vertices. The gradient is with respect to vertices and vertex colours. The image is the "
+            "first one that the renderer draws. Each row is measured in a new process that has drawn a small "
+            "image before, so that all code is compiled.",
             "",
             "In the table, `growth of the process` is the increase of the peak memory of the process, without inputs "
             "and outputs. `NumPy and Python` is the peak of the memory that NumPy and Python allocate, including "

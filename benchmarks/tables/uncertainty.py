@@ -191,12 +191,12 @@ def page() -> None:
         "",
         "![Log-likelihood against processor time](uncertainty.png)",
         "",
-        "The figure shows the gain in log-likelihood over one model without any method, as a mean over runs with "
-        "the same data; the tables give standard errors. A method has one point for each value of its knob: the "
-        "number of draws of the weights or of dropout masks (1, 3, 10, 30), or of members (1, 2, 3, 5). Times "
-        f"are processor times of the density and the log-likelihood of a row, in a batch of {ROWS} rows on one "
-        f"thread, as the median of {ROUNDS} repetitions; differences below a factor of two between methods "
-        "without a knob are noise. Frozen and exported models are faster.",
+        "The figure shows by how much the log-likelihood of a method is higher than that of one model without "
+        "any method in the same run, as a mean over the runs; the tables give standard errors. A method has one "
+        "point for each value of its knob: the number of draws of the weights or of dropout masks (1, 3, 10, "
+        "30), or of members (1, 2, 3, 5). Times are processor times of the density and the log-likelihood of a "
+        f"row, in a batch of {ROWS} rows on one thread, as the median of {ROUNDS} repetitions; differences below "
+        "a factor of two between methods without a knob are noise. Frozen and exported models are faster.",
         "",
         "## Which method wins at which run time",
         "",

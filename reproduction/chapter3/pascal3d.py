@@ -90,7 +90,7 @@ def class_mean_section(rows: list[dict[str, Any]]) -> str:
             lines += [
                 "",
                 f"The log-likelihood of `{first}` minus that of `{second}` is {gap.mean():+.2f} ± {error:.2f} nats; it "
-                f"is above 0 in {(gap > 0).sum()} classes.",
+                f"is above 0 in {(gap > 0).sum()} of {len(gap)} classes.",
             ]
     return "\n".join(lines)
 

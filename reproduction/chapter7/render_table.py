@@ -115,9 +115,9 @@ def page(rows: Mapping[tuple[str, str], Mapping[str, Any]]) -> str:
         "",
         "## Table 7.1 as printed in the thesis",
         "",
-        "The thesis used photographs of 68 real people with 410 × 308 pixels. These photographs are not public. It "
-        "also used another mesh renderer (without anti-aliasing), another network and another machine. So only the "
-        "order of rows can be compared.",
+        "The thesis used photographs of 68 real people with 410 × 308 pixels. These photographs are not public. "
+        "The thesis also used another mesh renderer (without anti-aliasing), another network and another machine. "
+        "So only the order of rows can be compared.",
         "",
         "| renderer | vertices | PSNR, dB | LPIPS | ms per frame |",
         "|---|---|---:|---:|---:|",

@@ -260,8 +260,8 @@ def page(soak: Soak, kinds: list[Soaked]) -> str:
             "eight times, and was then repeated without a kill until it finished. The test is made by `python -m "
             f"tests.soak {soak.count} --folder <folder>`, which is repeated until all kills are made.",
             "",
-            "The test has not yet killed the following kinds of commands and processes: "
-            f"{'; '.join(missing) or 'none'}.",
+            "The test has not yet killed the following commands and processes (each item names a command and, "
+            f"after a comma, the process that is killed): {'; '.join(missing) or 'none'}.",
             "",
             f"- *all ended*: no process of the command was alive {ALLOWED:.0f} s after the kill; the longest time is "
             "in brackets. If a job, a fork server or a worker is killed, the command goes on and starts the job "
