@@ -58,7 +58,6 @@ MEANINGS = {
     "trainer.devices": "Number of devices of a machine, or a list of their indices.",
     "trainer.num_nodes": "Number of machines.",
     "trainer.accelerator": "Kind of device; `auto` takes a GPU if there is one.",
-    "optimizer.learning_rate": "Learning rate.",
     "optimizer.weight_decay": "Weight decay.",
     "optimizer.schedule": "Change of the learning rate over the training.",
     "mode": "Task of the command, and its options; see below.",

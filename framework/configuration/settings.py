@@ -1,10 +1,20 @@
 """Settings of the core: types, ranges and defaults; the settings of plugins are checked by their constructors."""
 
+import math
 import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
 
 from framework.configuration.schema import check, forbid_targets
 from framework.errors import ConfigError
@@ -21,6 +31,18 @@ def _share(value: Any) -> Any:
             "expected a number of batches (an integer, 1 or more), or a share of them (0.0 < share <= 1.0)"
         )
     return value
+
+
+def _rate(value: Any) -> Any:
+    if value == "auto":
+        return value
+    try:
+        number = TypeAdapter(float).validate_python(value)
+    except ValidationError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise ValueError("expected a number greater than 0, or auto")
+    return number
 
 
 def _devices(value: Any) -> Any:
@@ -71,7 +93,8 @@ class OptimizerSettings(_Strict):
     """Optimiser of torch.optim, by its name in lower case, and schedule of its learning rate."""
 
     name: Literal["adam", "adamw", "sgd", "nadam", "radam"] = "adamw"
-    learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1e-3
+    learning_rate: Annotated[float | Literal["auto"], BeforeValidator(_rate)] = 1e-3
+    """Learning rate, above 0; auto: the rate at which the loss falls fastest in a range test before the training."""
     momentum: Annotated[float, Field(ge=0, lt=1)] | None = None
     """Momentum of `sgd`; None means 0. The other optimisers have fixed kinds of momentum and refuse this setting."""
     weight_decay: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
@@ -84,6 +107,19 @@ class OptimizerSettings(_Strict):
     """Epochs after which the schedule `step` reduces the learning rate."""
     patience: Count = 5
     """Number of epochs without a lower validation loss after which the schedule `plateau` reduces the learning rate."""
+
+    @property
+    def rate(self) -> float:
+        """Return the learning rate.
+
+        Raises:
+            ConfigError: The rate is "auto" and has not been replaced by a number.
+        """
+        if isinstance(self.learning_rate, str):
+            raise ConfigError(
+                "optimizer.learning_rate = 'auto' is found before a training by gradient only. Set it to a number."
+            )
+        return self.learning_rate
 
     @model_validator(mode="after")
     def _fits(self) -> "OptimizerSettings":

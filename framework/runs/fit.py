@@ -3,7 +3,7 @@
 import sys
 import time
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytorch_lightning as pl
 import torch
@@ -19,7 +19,7 @@ from framework.errors import ConfigError
 from framework.model import FrozenFrontEnd, fitted_models, learns
 from framework.runs.job import PRUNED, RECORD
 from framework.runs.resuming import begin_again, resume_arguments
-from framework.runs.run import PROFILE, Run
+from framework.runs.run import PROFILE, RANGE_TEST, Run
 from framework.runs.session import Session, trained_batches
 from framework.storage.checkpoints import read
 from framework.storage.first_rank import first_rank
@@ -40,6 +40,7 @@ from framework.training.module import (
     Training,
 )
 from framework.training.progress import Progress
+from framework.training.range_test import RangeTestResult, measure_losses, range_test_figure, suggest
 from framework.training.rank_processes import end_together
 from framework.uncertainty import SelfTraining, outermost, self_training
 
@@ -151,11 +152,14 @@ def _fit_by_gradient(session: Session, run: Run) -> Fitted:
     fed = (
         session.data if session.objectives else _cache_features(session)
     )  # objectives may change or add inputs
+    optimizer = settings.optimizer
+    if optimizer.learning_rate == "auto":
+        optimizer = optimizer.model_copy(update={"learning_rate": _find_learning_rate(session, run, fed)})
     training = Training(
         session.predictor,
         session.objectives,
         fed,
-        settings.optimizer,
+        optimizer,
         settings.seed,
         session.description(),
         cached=fed is not session.data,
@@ -183,6 +187,59 @@ def _fit_by_gradient(session: Session, run: Run) -> Fitted:
     session.device = trainer.strategy.root_device
     pruned = any(isinstance(callback, StopIfPruned) and callback.pruned for callback in trainer.callbacks)  # type: ignore[attr-defined]
     return Fitted(keep.kept_loss, keep.kept_epoch, pruned)
+
+
+def _find_learning_rate(session: Session, run: Run, fed: Data) -> float:
+    """Find the learning rate by a range test, print the reason, record it and draw a figure.
+
+    A resumed run keeps the rate that it has recorded.
+
+    Args:
+        session: session of the training.
+        run: run in progress.
+        fed: data with which the model is trained; other than those of the session if features are precomputed.
+    """
+    path = run.folder / RANGE_TEST
+    if run.resumed and path.is_file():
+        result = RangeTestResult.read(path)
+        session.console.print(
+            f"learning rate: {result.learning_rate:.2g}, found when this run began",
+            soft_wrap=True,
+            highlight=False,
+        )
+        return result.learning_rate
+    settings = session.settings
+    several = outermost(session.predictor)
+    batches = session.batches(fed)
+    batches.orders = several.model_count if several else 1
+    rates, losses = measure_losses(
+        session.predictor,
+        session.objectives,
+        fed,
+        batches,
+        settings.optimizer,
+        _with_precision(settings.trainer),
+        run.stopper,
+        cached=fed is not session.data,
+    )
+    result = suggest(rates, losses)
+    session.console.print(result.sentence(), soft_wrap=True, highlight=False)
+    if first_rank():
+        result.save(path)
+        run.tracker.log_artifact(path)
+    run.tracker.set_tags(
+        {"learning_rate": f"{result.learning_rate:.4g}", "learning_rate.reason": result.sentence()}
+    )
+    run.tracker.log_metrics({"learning_rate": result.learning_rate}, 0, 0)
+    if settings.pictures and first_rank():
+        from framework.figures.style import save_figure
+
+        folder = run.folder / "figures"
+        folder.mkdir(exist_ok=True)
+        title = f"{session.title}: learning rate"
+        figure = range_test_figure(result, title, synthetic=session.data.synthetic)
+        run.tracker.log_artifact(save_figure(figure, folder / "learning_rate", settings.pictures), "figures")
+    return result.learning_rate
 
 
 def _give_up(run: Run, error: BaseException) -> None:
@@ -236,9 +293,9 @@ def _trainer(run: Run, keep: KeepCheckpoints, console: Console) -> pl.Trainer:
     if chosen.get("enable_progress_bar", True):
         terminal = Console(stderr=True, quiet=console.quiet)
         callbacks.append(Progress(terminal if terminal.is_terminal else console))
-    arguments = {key: value for key, value in chosen.items() if key not in TRAINER_OURS}
-    if arguments.get("precision") == "auto":
-        arguments["precision"] = precision = _fast_precision(chosen.get("accelerator"))
+    arguments = _with_precision({key: value for key, value in chosen.items() if key not in TRAINER_OURS})
+    if chosen.get("precision") == "auto":
+        precision = arguments["precision"]
         console.print(f"precision: {precision}, which trainer.precision=auto chooses for this processor")
         run.tracker.set_tags({"precision": precision})
     arguments |= {"enable_progress_bar": False}  # Lightning's own progress bar
@@ -255,6 +312,13 @@ def _trainer(run: Run, keep: KeepCheckpoints, console: Console) -> pl.Trainer:
         use_distributed_sampler=False,
         default_root_dir=run.folder,
     )
+
+
+def _with_precision(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Return arguments of Lightning's Trainer in which the precision "auto" is replaced by that of this machine."""
+    if arguments.get("precision") != "auto":
+        return arguments
+    return {**arguments, "precision": _fast_precision(arguments.get("accelerator"))}
 
 
 def _fast_precision(accelerator: str | None) -> str:

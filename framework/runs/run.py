@@ -30,6 +30,8 @@ TRACEBACK = "traceback.txt"
 """File with the traceback of a run that failed or was stopped; it is removed when the run is resumed and finishes."""
 PROFILE = "fit-profile.txt"
 """File with the report of the profiler of a training (`trainer.profiler`); Lightning gives it this name."""
+RANGE_TEST = "learning_rate.json"
+"""File with the losses of the range test and the learning rate that was found (`optimizer.learning_rate=auto`)."""
 LEFT_BY_RUNS = (
     "config.yaml",
     "overrides.yaml",
@@ -44,6 +46,7 @@ LEFT_BY_RUNS = (
     TRACEBACK,
     "unreadable.txt",
     PROFILE,
+    RANGE_TEST,
     "metrics.csv",
     "tensorboard",
     "wandb",

@@ -227,7 +227,7 @@ class Training(pl.LightningModule):
             for objective, adversary in self._adversaries()
         ]
         optimizer = OPTIMIZERS[settings.name](
-            groups, lr=settings.learning_rate, weight_decay=settings.weight_decay, **options
+            groups, lr=settings.rate, weight_decay=settings.weight_decay, **options
         )
         total, epoch = self._planned_steps()
         factors = [make_schedule(settings, total, epoch)]
