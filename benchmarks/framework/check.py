@@ -32,8 +32,9 @@ def examine_faults() -> list[str]:
     lines = []
     for fault in (*ALL_FAULTS, *FURTHER_FAULTS):
         failed = list(dict.fromkeys(result.name for result in fault.findings() if not result.holds))
+        name = fault.name.replace("|", r"\|")  # a bare | would end the cell
         lines.append(
-            f"| {fault.name} | {len(fault.target.names)} {fault.target.kind} | {', '.join(failed) or '**missed**'} |"
+            f"| {name} | {len(fault.target.names)} {fault.target.kind} | {', '.join(failed) or '**missed**'} |"
         )
         sys.stdout.write(lines[-1] + "\n")
     return lines
