@@ -313,13 +313,15 @@ def missed(rows: list[dict[str, Any]]) -> str:
                 f"on {name}, the 90 % region covers {covered:.3f} of the test rows instead of {COVERED[0]} to "
                 f"{COVERED[1]}"
             )
-        for key, what, limit, unit in (
+        for key, subject, limit, unit in (
             ("sweep_seconds", "the command", LONGEST, "s"),
             ("microseconds", "a density", SLOWEST, "µs"),
         ):
             number = median_of(own, key)
             if number and number > limit:
-                texts.append(f"on {name}, {what} takes {number:.1f} {unit} instead of at most {limit} {unit}")
+                texts.append(
+                    f"on {name}, {subject} takes {number:.1f} {unit} instead of at most {limit} {unit}"
+                )
     return f"These goals are not reached: {'; '.join(texts)}." if texts else "All goals are reached."
 
 
