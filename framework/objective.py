@@ -3,13 +3,13 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
-from framework.data import Batch
+from framework.data import Batch, Data
 from framework.model import Predictor
 
 Share = Annotated[float, Field(ge=0, lt=1)]
@@ -54,6 +54,19 @@ class Objective(nn.Module, ABC):
     """
     logged_terms: Mapping[str, Tensor] = {}
     """Detached scalars of the last batch that are logged beside the loss, by the name of the term."""
+
+    def check_data(self, data: Data, config: Mapping[str, Any]) -> None:
+        """Refuse data to which the objective does not apply; called once before training.
+
+        The default accepts all data.
+
+        Args:
+            data: the data set of the run, prepared.
+            config: its config, with every parameter.
+
+        Raises:
+            ConfigError: the objective does not apply to the data.
+        """
 
     @abstractmethod
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:

@@ -211,6 +211,8 @@ def for_training(config: Config) -> Session:
     data.prepare()
     introduce(data, console)
     objectives = build_objectives(parts)
+    for objective in objectives:
+        objective.check_data(data, parts["data"])
     seed = config.settings.seed
     if start is None:
         head = assembly.take_head(data.target)
