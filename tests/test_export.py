@@ -56,7 +56,7 @@ HEADS = [name for name in installed("density_head") if name not in {*FITTED, *RE
 
 
 REFUSED_ENCODERS = {
-    "points": "random choice of points|order of the farthest points",
+    "points": "A random choice of points cannot be exported|order of the farthest points",
     "pointnet2": "order of the farthest points",
     "point_nn": "order of the farthest points",
     "dgcnn": "search for nearest neighbours",
@@ -64,11 +64,11 @@ REFUSED_ENCODERS = {
     "rasterised": "Its part Rasterised is not a sequence of operations|does not accept the random inputs",
     "ballistic": "Its part BallisticEncoder is not a sequence of operations|does not accept the random inputs",
     "extrapolation": "Its part ExtrapolationEncoder is not a sequence of operations|does not accept the random inputs",
-    "unet: odd size": "A crop depends on the pixels",
-    "unet: over its input": "A crop depends on the pixels",
-    "slim: odd size": "A crop depends on the pixels",
-    "slim: over its input": "A crop depends on the pixels",
-    "slim: a scale, squares of 4": "A crop depends on the pixels",
+    "unet: odd size": "A crop cannot be exported",
+    "unet: over its input": "A crop cannot be exported",
+    "slim: odd size": "A crop cannot be exported",
+    "slim: over its input": "A crop cannot be exported",
+    "slim: a scale, squares of 4": "A crop cannot be exported",
     "slim: bfloat16, whole frame": "ONNX Runtime cannot load it",
     "bps: rotation-invariant": "axes of a cloud are eigenvectors",
 }

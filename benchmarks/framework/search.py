@@ -195,8 +195,9 @@ def section(name: str, runs: Mapping[str, list[Trial]]) -> list[str]:
         *lines,
         "",
         "A grid dominates the front of a search if the points of the grid beat every point of this front. This "
-        f"happened in {dominated} of {len(searches) * len(grids)} comparisons. Conversely, a search beats on average "
-        + " and ".join(f"{count} points on the front of the {grid}" for count, grid in zip(against, grids, strict=True))
+        f"happened in {dominated} of {len(searches) * len(grids)} comparisons. The following counts are means over "
+        "the searches of how many points on the front of a grid the search beats: "
+        + ", ".join(f"{count} for the {grid}" for count, grid in zip(against, grids, strict=True))
         + ".",
         "",
         "The standard deviation of single measurements of the run time of the same network is "

@@ -119,7 +119,8 @@ def main(runs: Sequence[str]) -> None:
         "",
         about,
         "",
-        "The networks in the figures were trained as follows:",
+        '"Network over the mesh" means a network that reads the drawn mesh and improves its image. The networks in the '
+        "figures were trained as follows:",
         *trained,
         "",
         *lines,

@@ -31,10 +31,8 @@ def require_forest(arrays: Mapping[str, np.ndarray], classes: int, numbers: int)
             if arrays[name].size
         ]
         if filled or read:
-            raise ValueError(
-                f"the forest has no nodes (`feature` is empty), but {', '.join(filled) or 'read'} is not empty or "
-                "not 0"
-            )
+            reason = f"{', '.join(filled)} is not empty" if filled else "`read` is not 0"
+            raise ValueError(f"the forest has no nodes (`feature` is empty), but {reason}")
         return
     _require_shape(arrays, "threshold", (len(feature),))
     _require_shape(arrays, "branch", (len(feature), 2))

@@ -58,7 +58,8 @@ class _Reader:
     def length(self) -> int:
         if self.marker() != "L":
             raise ValueError(
-                f"byte {self.place - 1} of the UBJSON content does not begin a length; expected L"
+                f"byte {self.place - 1} of the UBJSON content does not begin a length; expected L, the mark of a "
+                "64-bit integer"
             )
         return LENGTH.unpack(self.take(8))[0]
 

@@ -36,7 +36,10 @@ def choose_points(
     """
     if choice == "random":
         if torch.compiler.is_exporting():
-            raise ConfigError("The random choice of points depends on the number of points of each cloud.")
+            raise ConfigError(
+                "A random choice of points cannot be exported, because it depends on the number of points of each "
+                "cloud. Train the model with another choice of points."
+            )
         rows = [_random(size, count, seed) for size in counts.tolist()]
         return torch.stack(rows).to(clouds.device) if rows else counts.new_zeros(0, count)
     return farthest(clouds[..., :3], counts, count)

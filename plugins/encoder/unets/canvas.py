@@ -225,7 +225,9 @@ def subject_box(image: Float[Tensor, "channels height width"], stride: int, marg
     The box is widened by `margin` pixels within the image, then to multiples of `stride`.
     """
     if torch.compiler.is_exporting():
-        raise ConfigError("A crop depends on the pixels of each image. Train the model with crop=null.")
+        raise ConfigError(
+            "A crop cannot be exported, because it depends on the pixels of each image. Train the model with crop=null."
+        )
     shown = (image.detach() != EMPTY).view(torch.uint8).amax(0)  # true for NaN; bytes have a faster maximum
     ends: list[int] = []
     for line in (shown.amax(1), shown.amax(0)):
