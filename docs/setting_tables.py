@@ -20,6 +20,7 @@ from pydantic.fields import FieldInfo
 from framework.configuration.modes import MODES, UNUSED_BY_TRAINING
 from framework.configuration.registry import GROUPS, group_of
 from framework.configuration.settings import (
+    CALLBACKS,
     BudgetSettings,
     LoggerSettings,
     OptimizerSettings,
@@ -82,6 +83,12 @@ MEANINGS = {
 }
 
 
+CALLBACK_NOTE = (
+    "`trainer.callbacks=[weight_averaging,model_summary]` chooses callbacks, and these keys set them. See "
+    "[training](site:how_to/training.md)."
+)
+
+
 class Setting(NamedTuple):
     """One row of a table of settings."""
 
@@ -111,8 +118,19 @@ def settings_page() -> str:
         prefix = title.strip("`")
         rows = [row for row in model_settings(model, file, f"{prefix}.") if row.key != f"{prefix}.name"]
         parts += [f"## {title}", _note(prefix), table(rows)]
+        if prefix == "trainer":
+            parts += ["### `trainer.callbacks`", CALLBACK_NOTE, table(_callback_settings())]
     parts += ["## Modes", "`mode=<name>` chooses what a command does.", *_modes(), _readers()]
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _callback_settings() -> list[Setting]:
+    """Return the settings of all callbacks."""
+    return [
+        row
+        for name, model in CALLBACKS.items()
+        for row in model_settings(model, "", f"trainer.callbacks.{name}.")
+    ]
 
 
 def _note(prefix: str) -> str:

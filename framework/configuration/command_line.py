@@ -30,7 +30,7 @@ def command_line(arguments: list[str]) -> list[str]:
     _refuse_code_and_passwords(arguments)
     arguments = _put_flags_first(arguments)
     require_harmless(arguments, groups())
-    arguments = _add_trainer_keys(_list_loggers(arguments))
+    arguments = _add_trainer_keys(_name_callbacks(_list_loggers(arguments)))
     arguments = _name_newest_run(_use_resumed_folder(as_stored(arguments)))
     return _sweep_single_values(_choose_preset(arguments))
 
@@ -46,7 +46,35 @@ def _add_trainer_keys(arguments: list[str]) -> list[str]:
 
     known = yaml.safe_load((folder() / "trainer/default.yaml").read_text(encoding="utf-8"))
     new = {f"trainer.{key}" for key in TrainerSettings.model_fields.keys() - known.keys()}
-    return [f"++{argument}" if argument.partition("=")[0] in new else argument for argument in arguments]
+    return [
+        f"++{argument}"
+        if argument.partition("=")[0] in new or argument.startswith("trainer.callbacks.")
+        else argument
+        for argument in arguments
+    ]
+
+
+def _name_callbacks(arguments: list[str]) -> list[str]:
+    """Replace `trainer.callbacks=[a,b]` by a mapping, so that `trainer.callbacks.a.key=value` can set a key of it.
+
+    Raises:
+        ConfigError: There is no such callback, or it cannot be chosen.
+    """
+    chosen = []
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if key.lstrip("+") == "trainer.callbacks" and value.startswith("[") and value.count("[") == 1:
+            from framework.configuration.settings import refuse_callback
+
+            names = [name.strip() for name in value.strip("[]").split(",") if name.strip()]
+            for name in names:
+                try:
+                    refuse_callback(name)
+                except ValueError as error:
+                    raise ConfigError(f"{argument}: {error}.") from None
+            argument = f"{key}={{{','.join(f'{name}:{{}}' for name in names)}}}"
+        chosen.append(argument)
+    return chosen
 
 
 def _list_loggers(arguments: list[str]) -> list[str]:

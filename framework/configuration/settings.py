@@ -17,7 +17,7 @@ from pydantic import (
 )
 
 from framework.configuration.schema import check, forbid_targets
-from framework.errors import ConfigError
+from framework.errors import ConfigError, did_you_mean, shorten
 from framework.tracking.stores import require_no_password
 
 if TYPE_CHECKING:
@@ -193,6 +193,106 @@ class BudgetSettings(_Strict):
         return self.milliseconds is not None or self.error is not None
 
 
+REFUSED_CALLBACKS = {
+    "lr_monitor": "the learning rate is always recorded, as train/learning_rate in the journal",
+    "learning_rate_monitor": "the learning rate is always recorded, as train/learning_rate in the journal",
+    "lr_finder": "set optimizer.learning_rate=auto instead",
+    "learning_rate_finder": "set optimizer.learning_rate=auto instead",
+    "swa": "choose weight_averaging with decay=null, or the wrapper uncertainty=[swag]",
+    "stochastic_weight_averaging": "choose weight_averaging with decay=null, or the wrapper uncertainty=[swag]",
+    "ema": "choose weight_averaging",
+    "timer": "set trainer.max_time instead",
+    "model_checkpoint": "checkpoints are always written; set trainer.keep and trainer.checkpoint_every_steps",
+    "on_exception_checkpoint": "a run that fails keeps its checkpoints; resume=<folder of the run> continues it",
+    "progress_bar": "set trainer.enable_progress_bar instead",
+    "rich_progress_bar": "set trainer.enable_progress_bar instead",
+    "tqdm_progress_bar": "set trainer.enable_progress_bar instead",
+    "rich_model_summary": "choose model_summary",
+    "device_stats_monitor": "set trainer.profiler=simple instead",
+    "throughput_monitor": "set trainer.profiler=simple instead",
+    "batch_size_finder": "set batch_size to a number, because results depend on it",
+    "gradient_accumulation_scheduler": "choose gradient_accumulation",
+    "lambda_callback": "a config holds no code",
+    "model_pruning": "a resumed run would not continue with the same bits",
+    "backbone_finetuning": "a resumed run would not continue with the same bits; encoders have settings to freeze them",
+    "prediction_writer": "mode=predict writes predictions",
+}
+"""Callbacks of Lightning that cannot be chosen, each with the reason or what to do instead."""
+
+
+class EarlyStoppingSettings(_Strict):
+    """When a training stops early, in addition to `trainer.patience`."""
+
+    min_delta: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    """Smallest fall of the validation loss that counts, nats."""
+    stopping_threshold: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    """Validation loss below which the training stops, nats."""
+
+
+class WeightAveragingSettings(_Strict):
+    """Average of the weights over the steps of a training."""
+
+    decay: Annotated[float, Field(gt=0, lt=1)] | None = 0.999
+    """Share of the old average that a step keeps; null: the mean of all steps with equal weights."""
+    first_epoch: NotNegative = 0
+    """Epoch, from 0, at which the average begins."""
+
+
+class GradientAccumulationSettings(_Strict):
+    """Numbers of batches whose gradients are added for a step."""
+
+    batches: Annotated[dict[NotNegative, Count], Field(min_length=1)]
+    """Number of batches of a step from an epoch on, by the epoch, from 0; before the first one a step has one batch."""
+
+
+class ModelSummarySettings(_Strict):
+    """Table of the parts of the model that is printed before the training."""
+
+    max_depth: Annotated[int, Field(strict=True, ge=-1)] = 1
+    """Depth of the parts that are listed; -1 lists all."""
+
+
+CALLBACKS: Mapping[str, type[BaseModel]] = {
+    "early_stopping": EarlyStoppingSettings,
+    "weight_averaging": WeightAveragingSettings,
+    "gradient_accumulation": GradientAccumulationSettings,
+    "model_summary": ModelSummarySettings,
+}
+"""Settings of the callbacks that a config may choose, by the names of the callbacks."""
+
+
+class CallbackSettings(_Strict):
+    """Chosen callbacks of a training, with their settings; None for a callback that is not chosen."""
+
+    early_stopping: EarlyStoppingSettings | None = None
+    weight_averaging: WeightAveragingSettings | None = None
+    gradient_accumulation: GradientAccumulationSettings | None = None
+    model_summary: ModelSummarySettings | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_name(cls, value: Any) -> Any:
+        names = list(value) if isinstance(value, list | tuple | dict) else []
+        for name in names:
+            refuse_callback(name)
+        return {name: {} for name in names} if isinstance(value, list | tuple) else value
+
+
+def refuse_callback(name: Any) -> None:
+    """Raise an error if Lightning's callback of this name cannot be chosen, or if there is no such callback.
+
+    Raises:
+        ValueError: The message says what to do instead, or names the nearest callback.
+    """
+    if name in CallbackSettings.model_fields:
+        return
+    known = ", ".join(CallbackSettings.model_fields)
+    if name in REFUSED_CALLBACKS:
+        raise ValueError(f"the callback {name} cannot be chosen: {REFUSED_CALLBACKS[name]}")
+    near = did_you_mean(str(name), CallbackSettings.model_fields)
+    raise ValueError(f"there is no callback {shorten(str(name))!r}.{near} The callbacks are {known}")
+
+
 class TrainerSettings(_Strict):
     """Keys of `trainer`: the framework's own, and the arguments of pytorch_lightning.Trainer that a config can hold.
 
@@ -200,6 +300,8 @@ class TrainerSettings(_Strict):
     listed here because importing Lightning takes seconds.
     """
 
+    callbacks: CallbackSettings | None = None
+    """Callbacks of Lightning by name, such as `[weight_averaging]`, with their settings."""
     patience: Count | None = None
     keep: Literal["best", "last"] | None = None
     checkpoint_every_steps: Count | None = None
@@ -244,7 +346,7 @@ class TrainerSettings(_Strict):
     model_registry: str | None = None
 
 
-TRAINER_OURS = {"patience", "checkpoint_every_steps", "log_every_steps", "keep"}
+TRAINER_OURS = {"callbacks", "patience", "checkpoint_every_steps", "log_every_steps", "keep"}
 """Keys of `trainer` that the framework reads; the others go to pytorch_lightning.Trainer."""
 
 
@@ -300,12 +402,21 @@ class Settings(_Strict):
         settings = cls.model_validate(dict(config))
         if settings.logger.uri is not None:
             require_no_password(settings.logger.uri)
+        callbacks = settings.trainer.get("callbacks")
+        for name, values in callbacks.items() if isinstance(callbacks, Mapping) else ():
+            if name in CALLBACKS and isinstance(values, Mapping):
+                check(CALLBACKS[name], values, f"trainer.callbacks.{name}")
         check(TrainerSettings, settings.trainer, "trainer")
         return settings
 
     def plain(self) -> dict[str, Any]:
         """Return the keys that the composed config sets, as plain values, which the run folder stores."""
         return self.model_dump(exclude_unset=True)
+
+    @property
+    def callbacks(self) -> CallbackSettings:
+        """Return the callbacks of the training and their settings."""
+        return CallbackSettings.model_validate(self.trainer.get("callbacks") or {})
 
     @property
     def bounded_trainer(self) -> dict[str, Any]:

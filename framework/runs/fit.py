@@ -12,7 +12,7 @@ from rich.console import Console
 from torch import distributed as dist
 
 from framework.configuration.loading import fill, predictor_weights
-from framework.configuration.settings import TRAINER_OURS, device_of
+from framework.configuration.settings import TRAINER_OURS, CallbackSettings, Settings, device_of
 from framework.data import Data
 from framework.encoder import FitsInputs
 from framework.errors import ConfigError
@@ -26,6 +26,7 @@ from framework.storage.first_rank import first_rank
 from framework.storage.processor import fast_bfloat16
 from framework.tracking.signals import Stopped
 from framework.training.cached_features import CachedFeatures, fits
+from framework.training.callbacks import build_callbacks
 from framework.training.checkpoint import WholeCheckpoints
 from framework.training.fitting import fit_at_once, mean_loss
 from framework.training.module import (
@@ -280,14 +281,18 @@ def _cache_features(session: Session) -> Data:
 def _trainer(run: Run, keep: KeepCheckpoints, console: Console) -> pl.Trainer:
     chosen = run.settings.bounded_trainer
     patience = chosen.get("patience")
+    named = run.settings.callbacks
+    _require_fitting(named, run.settings)
     callbacks: list[pl.Callback] = [
         LogMetrics(run.tracker, chosen.get("log_every_steps") or 10),
         FollowTraining(),
-        keep,
+        *build_callbacks(named, keep, console),
         StopAtBatch(run.stopper, keep),
     ]
     if patience:
-        callbacks.append(StopEarly(patience))
+        callbacks.append(
+            StopEarly(patience, **(named.early_stopping.model_dump() if named.early_stopping else {}))
+        )
     if (run.folder / RECORD).is_file():  # the run is a job of a sweep, which may be a search that prunes
         callbacks.append(StopIfPruned(run.folder / PRUNED))
     if chosen.get("enable_progress_bar", True):
@@ -312,6 +317,31 @@ def _trainer(run: Run, keep: KeepCheckpoints, console: Console) -> pl.Trainer:
         use_distributed_sampler=False,
         default_root_dir=run.folder,
     )
+
+
+def _require_fitting(callbacks: CallbackSettings, settings: Settings) -> None:
+    """Refuse callbacks that contradict other settings of the training.
+
+    Raises:
+        ConfigError: The message says which setting to change.
+    """
+    if callbacks.early_stopping is not None and not settings.trainer.get("patience"):
+        raise ConfigError(
+            "trainer.callbacks=[early_stopping] has no effect with trainer.patience=null, which never stops. Set "
+            "trainer.patience to a number of validations, or leave early_stopping out."
+        )
+    if callbacks.gradient_accumulation is None:
+        return
+    if (settings.trainer.get("accumulate_grad_batches") or 1) != 1:
+        raise ConfigError(
+            "trainer.callbacks=[gradient_accumulation] and trainer.accumulate_grad_batches both say how many batches a "
+            "step has. Leave one of them out."
+        )
+    if settings.optimizer.schedule == "step":
+        raise ConfigError(
+            "optimizer.schedule=step counts epochs of equally many steps, but gradient_accumulation changes the number "
+            "of steps of an epoch. Choose another schedule, or leave gradient_accumulation out of trainer.callbacks."
+        )
 
 
 def _with_precision(arguments: dict[str, Any]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import pytorch_lightning as pl
 import torch
+from pytorch_lightning.callbacks import GradientAccumulationScheduler
 from pytorch_lightning.callbacks.early_stopping import EarlyStopping, EarlyStoppingReason
 from pytorch_lightning.profilers import PassThroughProfiler
 from torch import Tensor, nn
@@ -299,7 +300,15 @@ class Training(pl.LightningModule):
         limit = trainer.limit_train_batches
         batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
         epoch = math.ceil(batches / trainer.accumulate_grad_batches)
-        steps = epoch * max(1, trainer.max_epochs or 1)
+        epochs = max(1, trainer.max_epochs or 1)
+        schedule = next(
+            (each for each in trainer.callbacks if isinstance(each, GradientAccumulationScheduler)), None
+        )
+        steps = epoch * epochs
+        if schedule is not None:
+            steps = sum(
+                math.ceil(batches / schedule.get_accumulate_grad_batches(number)) for number in range(epochs)
+            )
         return max(1, min(steps, trainer.max_steps) if trainer.max_steps >= 0 else steps), epoch
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -332,6 +341,17 @@ class BatchCallback(pl.Callback):
     on_before_backward: Any = None
     on_after_backward: Any = None
     on_before_optimizer_step: Any = None
+
+    @staticmethod
+    def ends_step(trainer: pl.Trainer) -> bool:
+        """Return whether the present training batch is the last one of an optimiser step.
+
+        With accumulated gradients a step has several batches. Between them, nothing may be saved: a checkpoint does not
+        hold the gradients of the step's first batches.
+        """
+        return (
+            trainer.is_last_batch or (trainer.fit_loop.batch_idx + 1) % trainer.accumulate_grad_batches == 0
+        )
 
 
 class NoProfiler(PassThroughProfiler):
@@ -404,7 +424,8 @@ class KeepCheckpoints(BatchCallback):
     ) -> None:
         """Save last.ckpt every `every_steps` steps."""
         # Not at an epoch's last batch: a run resumed from there would skip the validation that follows.
-        if self.every_steps and trainer.global_step % self.every_steps == 0 and not trainer.is_last_batch:
+        due = self.every_steps and trainer.global_step % self.every_steps == 0 and not trainer.is_last_batch
+        if due and self.ends_step(trainer):
             self.save_last(trainer)
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
@@ -434,14 +455,24 @@ class KeepCheckpoints(BatchCallback):
 class StopEarly(BatchCallback, EarlyStopping):
     """Callback that stops a training after `patience` validations without a lower loss, or if the loss is not finite.
 
+    A loss counts as lower if it is lower by at least `min_delta`. Training also stops if the loss is below
+    `stopping_threshold`.
+
     The check runs at the end of a validation, because last.ckpt is written afterwards and must contain whether training
     shall stop. When a run is resumed, Lightning restores this decision, but not the trainer's flag to stop, which
     `on_train_start` sets again. Otherwise a run that was killed during its test would continue to train.
     """
 
-    def __init__(self, patience: int) -> None:
+    def __init__(
+        self, patience: int, min_delta: float = 0.0, stopping_threshold: float | None = None
+    ) -> None:
         super().__init__(
-            "validation/loss", patience=patience, check_finite=True, check_on_train_epoch_end=False
+            "validation/loss",
+            min_delta=min_delta,
+            patience=patience,
+            stopping_threshold=stopping_threshold,
+            check_finite=True,
+            check_on_train_epoch_end=False,
         )
 
     @property
@@ -493,7 +524,8 @@ class LogMetrics(BatchCallback):
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Log the training loss, the learning rate and the values in `Objective.logged_terms`."""
-        if (trainer.global_step % self.every_steps == 0 or trainer.is_last_batch) and trainer.is_global_zero:
+        due = trainer.global_step % self.every_steps == 0 or trainer.is_last_batch
+        if due and self.ends_step(trainer) and trainer.is_global_zero:
             assert isinstance(pl_module, Training)
             rate = trainer.optimizers[0].param_groups[0]["lr"]
             objective_terms = {
@@ -516,7 +548,7 @@ class LogMetrics(BatchCallback):
 
 
 class StopAtBatch(BatchCallback):
-    """Callback that handles a signal at the end of the current training batch: it saves last.ckpt and stops the run.
+    """Callback that handles a signal at the end of the current training step: it saves last.ckpt and stops the run.
 
     A signal during the last batch of an epoch is handled at the end of the epoch.
 
@@ -543,7 +575,7 @@ class StopAtBatch(BatchCallback):
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Save last.ckpt and stop if a signal was received, except at the last batch of an epoch."""
-        if self._signal_received(trainer) and not trainer.is_last_batch:
+        if self.ends_step(trainer) and self._signal_received(trainer) and not trainer.is_last_batch:
             self.keep.save_last(trainer)
             self.stopper.stop()
 
