@@ -94,7 +94,7 @@ class Model:
         batches: list[Batch] = [
             fetch(samples, range(start, min(start + BLOCK, count))) for start in range(0, count, BLOCK)
         ]
-        found = evaluate(
+        results = evaluate(
             self.predictor,
             batches,
             [self.measure.metric],
@@ -103,7 +103,7 @@ class Model:
             seed=SEED,
             device=torch.device("cpu"),
         )
-        return found.total[self.measure.key]
+        return results.total[self.measure.key]
 
     def times(self, *settings: tuple[int, ...]) -> list[Rounds]:
         """Return the wall time of a batch at each setting, ms, in interleaved rounds."""

@@ -16,9 +16,9 @@ RUN = ("experiment=moons/vanilla_128", "debug=fast", "pictures=false", "threads=
 STORES = ("none", "mlflow")
 
 
-def waiting(done: Done) -> float:
+def waiting(command: Done) -> float:
     """Return the seconds from the last line of the journal to the end of the command."""
-    return done.start + done.wall - done.lines[-1]["time"]
+    return command.start + command.wall - command.lines[-1]["time"]
 
 
 def cells(runs: Sequence[dict[str, Done]]) -> list[str]:

@@ -226,7 +226,7 @@ class _Queue:
     """Jobs of this user, as squeue last listed them; one call of squeue serves all jobs of a sweep."""
 
     def __init__(self) -> None:
-        self._asked = -math.inf
+        self._asked_at = -math.inf
         self._jobs: dict[str, Listed] | None = None
         self._warned = False
 
@@ -238,27 +238,27 @@ class _Queue:
             since: Time (`time.monotonic`) since which SLURM must have been asked.
             expected: Whether the state is expected to change soon.
         """
-        age = time.monotonic() - self._asked
-        if age > _INTERVAL or (age > _SHORT_INTERVAL and (expected or self._asked < since)):
+        age = time.monotonic() - self._asked_at
+        if age > _INTERVAL or (age > _SHORT_INTERVAL and (expected or self._asked_at < since)):
             self.ask()
-        if self._jobs is None or self._asked < since:
+        if self._jobs is None or self._asked_at < since:
             return None
         return self._jobs.get(identity, Listed(_UNLISTED, "", ""))
 
     def ask(self) -> None:
         """Call squeue."""
         options = ("--noheader", f"--user={getpass.getuser()}", "--states=all", "--format=%i|%T|%r|%j")
-        asked = time.monotonic()
-        done = subprocess.run(["squeue", *options], capture_output=True, text=True, check=False)
-        self._asked, self._jobs = asked, None
-        if done.returncode == 0:
-            lines = (line.split("|", 3) for line in done.stdout.splitlines() if line.count("|") >= 3)
+        asked_at = time.monotonic()
+        listing = subprocess.run(["squeue", *options], capture_output=True, text=True, check=False)
+        self._asked_at, self._jobs = asked_at, None
+        if listing.returncode == 0:
+            lines = (line.split("|", 3) for line in listing.stdout.splitlines() if line.count("|") >= 3)
             self._jobs = {identity: Listed(*rest) for identity, *rest in lines}
         elif not self._warned:
             _log.warning(
-                "squeue does not answer (%s); the sweep waits", shorten(" ".join(done.stderr.split()))
+                "squeue does not answer (%s); the sweep waits", shorten(" ".join(listing.stderr.split()))
             )
-        self._warned = done.returncode != 0
+        self._warned = listing.returncode != 0
 
 
 QUEUE = _Queue()

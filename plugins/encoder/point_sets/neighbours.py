@@ -36,7 +36,7 @@ def nearest_rows(
         raise ConfigError("The search for nearest neighbours depends on the number of points of each cloud.")
     numbers = counts.tolist()
     most = min(neighbours, max(numbers, default=1))
-    found, start = [counts.new_zeros(0, most)], 0
+    indices, start = [counts.new_zeros(0, most)], 0
     # a product in a lower precision would find other neighbours
     with torch.autocast(values.device.type, enabled=False):
         for part in values.to(torch.promote_types(values.dtype, torch.float32)).split(numbers):
@@ -46,9 +46,9 @@ def nearest_rows(
             if len(part) < most:
                 own = torch.arange(len(part), device=rows.device).unsqueeze(1)
                 rows = torch.cat([rows, own.expand(-1, most - len(part))], 1)
-            found.append(rows + start)
+            indices.append(rows + start)
             start += len(part)
-    return torch.cat(found)
+    return torch.cat(indices)
 
 
 def smallest(table: Float[Tensor, "row column"], most: int) -> Int[Tensor, "row kept"]:

@@ -93,10 +93,10 @@ class Distillation(Objective):
             "other input columns": (source.columns, tuple(data.columns)),
             "another state of the data, such as the scaling": (source.data_state, dict(data.state_dict())),
         }
-        for what, (stored, own) in compared.items():
+        for difference, (stored, own) in compared.items():
             if not _equal(stored, own):
                 raise ConfigError(
-                    f"The teacher {source.path} has {what} than this run: {quote(stored)}, but here "
+                    f"The teacher {source.path} has {difference} than this run: {quote(stored)}, but here "
                     f"{quote(own)}. Train the teacher with the data of this run, or give this run the data settings "
                     "of the teacher."
                 )
