@@ -13,7 +13,10 @@ from framework.errors import ConfigError, DataError, did_you_mean
 SLACK = 1e-3
 """Largest accepted difference between 1 and the sum of a vertex's skinning weights."""
 ROUNDING = 1e-6
-"""Largest difference between 1 and the sum of a vertex's weights at which no weights are divided by their sum."""
+"""Largest difference between 1 and the sum of a vertex's weights with which the weights are left as they are.
+
+If the difference is larger, the weights are divided by their sum.
+"""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,14 @@ from framework.geometry.camera import Camera
 
 
 class Turn(NamedTuple):
-    """Rotation that a movement causes: joint (a field of framework.bodies.poses.Skeleton), axis and sign."""
+    """Rotation of a joint that a movement causes.
+
+    Attributes:
+        movement: name of the movement in framework.bodies.poses.
+        role: name of the field of framework.bodies.poses.Skeleton that holds the rotated joint, or joints.
+        axis: axis of the rotation, "x", "y" or "z"; "hinge" for the axis about which the elbow bends.
+        sign: 1 if a positive angle of the movement rotates counter-clockwise about the axis, -1 if clockwise.
+    """
 
     movement: str
     role: str
@@ -45,7 +52,7 @@ SIDED = (
     Turn("spread", "hip", "z"),
     Turn("knee", "knee", "x"),
 )
-"""Rotations that movements of the left side cause; on the right side, rotations about y and z are opposite.
+"""Rotations that movements of the left side cause; on the right side, rotations about y and z have the opposite sign.
 
 If a joint has several movements, the last one in this tuple is applied first.
 """

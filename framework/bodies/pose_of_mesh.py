@@ -19,7 +19,7 @@ BENT = 0.7
 """Prior standard deviation, radians, of every joint except the root; the prior spreads a bend over several joints."""
 STEPS = 60
 ENOUGH = 1e-6
-"""Size of a step below which the search ends: radians, metres or standard deviations, as for `STEP`."""
+"""Size of a step below which the search ends, in radians for rotations, metres, or standard deviations of shape."""
 MOST = 2_500
 """Largest number of vertices that a fit uses; if a mesh has more vertices, the fit uses every n-th of them."""
 STEP = 1e-5
@@ -143,11 +143,11 @@ def _minimise(problem: _Problem, numbers: Float[Tensor, "number"]) -> Float[Tens
 
 
 def estimate_rotations(model: BodyModel, vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, "joint 3"]:
-    """Return the rotation of each joint relative to its parent's: axis times angle, radians.
+    """Return the rotation of each joint relative to its parent joint, as axis times angle, radians.
 
-    A joint's rotation is the one that best maps the template's vertices, weighted by how much they follow the joint, to
-    their positions in the mesh (Kabsch 1976). For the root all vertices have equal weights. A joint with too few
-    vertices to determine a rotation has the rotation 0 relative to its parent.
+    The rotation of a joint relative to the world is the one that best maps the template's vertices to their positions
+    in the mesh, weighted by how much the vertices follow the joint (Kabsch 1976). For the root all vertices have equal
+    weights. A joint with too few vertices to determine a rotation has the rotation 0 relative to its parent.
     """
     template = model.template.unflatten(0, (3, -1)).T
     upright = torch.eye(3).to(vertices)

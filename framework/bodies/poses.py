@@ -204,7 +204,7 @@ def rotations(
     """Return the joint rotations that put a body into the given poses, each as axis times angle in radians.
 
     Args:
-        body: the body; angles are measured from its rest pose as the module's text defines them.
+        body: the body, in any rest pose; the returned rotations lead from the rest pose to the given poses.
         where: the joints that each movement rotates.
         movements: angle of each movement in each pose, degrees, in the order of MOVEMENTS ("left elbow", "lean").
     """

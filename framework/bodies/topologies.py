@@ -40,8 +40,8 @@ class Split(NamedTuple):
 
     Attributes:
         corners: the triangles after the split.
-        pairs: the two ends of the split edge of each new vertex.
-        uv_pairs: the two ends of the split texture edge of each new texture coordinate.
+        pairs: for each new vertex, the two vertices of the split edge.
+        uv_pairs: for each new texture coordinate, the two texture coordinates of which it is the midpoint.
     """
 
     corners: Corners

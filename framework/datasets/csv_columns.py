@@ -395,11 +395,12 @@ def tables(
         files: the tables.
         names: names of the columns, in order.
         setting: the setting that names the columns.
-        writing: notation of the tables. If it is given, TRUE and FALSE are read as 1 and 0, as in a training table.
+        writing: notation of the tables. If it is given, TRUE and FALSE are read as 1 and 0.
         arrange: function that changes each table after it is read.
 
     Raises:
-        DataError: there is no file; or as in `read_columns`, `require` and `numbers`.
+        DataError: there is no file, a file is not a readable table, a name is not a column of a table, or a named
+            column holds a word, or no finite number in a row.
     """
     if not files:
         raise DataError(

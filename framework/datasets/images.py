@@ -209,7 +209,7 @@ def decode_opaque(image: Image.Image) -> Iterator[tuple[int, UInt8[np.ndarray, "
         The index of the first row of each strip of the image, and the pixels of the strip.
 
     Raises:
-        DataError: as in `decode`.
+        DataError: the range of the stored values is unknown.
     """
     for top, strip in _strips(image, _read_encoding(image), 3, opaque=True):
         yield top, np.asarray(strip)
@@ -447,7 +447,8 @@ def load_splits(
 def angle_fields(angles: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Tensor]:
     """Return the fields "target" and "group" for the angles of each sample, radians.
 
-    "target" holds the angles in [-π, π), one column per name, and "group" is 0 for every sample.
+    "target" holds the angles in [-π, π), one column per name. "group" is 0 for every sample, since these data have a
+    single group of results.
     """
     wrapped = [[(angle + math.pi) % (2 * math.pi) - math.pi for angle in row] for row in angles]
     return {

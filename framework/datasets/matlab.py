@@ -34,7 +34,9 @@ NAME_WITHIN = 512
 
 
 def read_variables(file: Path, names: Sequence[str] | None = None, remedy: str = RESTORE) -> dict[str, Any]:
-    """Read the named variables of a file, or all if `names` is None; see `parse_variables` for the result.
+    """Read the named variables of a file, or all if `names` is None.
+
+    `parse_variables` describes the returned values.
 
     Args:
         file: path of the file.

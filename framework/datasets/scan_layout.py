@@ -76,7 +76,13 @@ class Subject:
 
 @dataclass(frozen=True)
 class TexturePlaces:
-    """Texture coordinates in texture.png of the triangles of a topology; u points to the right, and v upwards."""
+    """Texture coordinates in texture.png of the triangles of a topology.
+
+    Attributes:
+        faces: vertices of each triangle.
+        uv: texture coordinates, u to the right and v upwards.
+        uv_faces: for each triangle, the rows of `uv` of its three corners.
+    """
 
     faces: Int[np.ndarray, "faces 3"]
     uv: Float[np.ndarray, "places 2"]

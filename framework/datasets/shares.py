@@ -13,7 +13,7 @@ def choose_held_out(
     """Return which samples to hold out: a share of all samples, equal in every class, but never all of a class.
 
     From each class, `share` times its size is held out, rounded down. Then one more sample is held out from each of the
-    classes with the largest remainders, until the total is reached.
+    classes with the largest remainders, until `share` times the number of all samples is reached.
     """
     held_out = np.zeros(len(labels), bool)
     counts = np.bincount(labels) if len(labels) else np.zeros(1, np.int64)

@@ -55,7 +55,7 @@ class Stacked(PlainDensity):
         """Return a pair for each of the K densities: the density, and the values at which it is evaluated.
 
         Args:
-            value: values (*sample, *batch, K, *event). If there is 1 in place of K, all densities get the same values.
+            value: values (*sample, *batch, K, *event), or (*sample, *batch, 1, *event), the same for all densities.
         """
         wide = value.expand(*value.shape[: self._axis], len(self.densities), *self.event_shape)
         return list(zip(self.densities, wide.unbind(self._axis), strict=True))

@@ -7,10 +7,10 @@ from framework.errors import UserError
 
 
 def refuse_nan(values: Float[Tensor, "batch"], quantity: str) -> Float[Tensor, "batch"]:
-    """Return `values`, one per sample, unchanged if none is NaN.
+    """Return `values` unchanged after checking that none of them is NaN.
 
     Args:
-        values: the numbers that are checked.
+        values: the numbers that are checked, one for each sample.
         quantity: name of the numbers in the plural, for the message, such as "entropies of the test split".
 
     Raises:

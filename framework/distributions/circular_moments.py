@@ -19,7 +19,7 @@ MASS_GAP = 1e-4
 If the difference is larger, the grid does not resolve the density.
 """
 COARSE_ENOUGH = {torch.float64: 1e-8}
-"""Largest |m_n|, for the highest orders n that the coarse grid gives, at which this grid resolves a density.
+"""Largest |m_n| of a density that counts as resolved by the coarse grid, for the highest orders n that this grid gives.
 
 The keys are number types. m_n are the moments of `CircularMoments`.
 """
@@ -29,7 +29,7 @@ ROUNDED = 4e-6
 In float32, rounding alone gives the moments of the highest orders a size of 2e-6, which no finer grid reduces.
 """
 LAST_MOMENTS = 1e-4
-"""Largest |m_n|, for the highest orders n that the fine grid gives, at which this grid resolves a density.
+"""Largest |m_n| of a density that counts as resolved by the fine grid, for the highest orders n that this grid gives.
 
 Moments of still higher orders are taken as 0. A von Mises density with concentration 3,500 (σ = 1°) does not need the
 fine grid, and one with 100,000 (σ = 0.18°) is still resolved on the fine grid.

@@ -123,7 +123,7 @@ class Mixture(PlainDensity):
 
     @property
     def mode(self) -> Tensor:
-        """Mode: for classes the most likely one, for one component its mode, otherwise a maximum found by `highest`.
+        """Mode: the most likely class, the mode of a single component, or else a maximum that `highest` finds.
 
         With `many_components.FEWEST` or more components over one number, the search starts only from the modes that
         `likeliest_modes` returns. If that function returns None, the search starts from all `mode_candidates`.
@@ -259,7 +259,7 @@ def estimate_of_sum(parts: protocol.Estimate, log_terms: Tensor, log_sum: Tensor
 
 @protocol.estimate.register
 def _(density: Mixture, value: Tensor) -> protocol.Estimate:
-    """Return the estimate of a mixture whose components draw independently; for one component, its estimate."""
+    """Return the estimate for a mixture whose components use independent draws; for one component, its estimate."""
     several = density.split_values(value)
     if len(several) > 1:
         return concatenate_estimates([protocol.estimate(density, part) for part in several])

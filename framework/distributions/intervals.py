@@ -28,7 +28,7 @@ from framework.distributions.symmetric import Symmetric
 from framework.errors import UserError
 
 DRAWS = 9999
-"""Number of draws of a density whose distribution function is not known.
+"""Number of draws from which an interval is computed if the distribution function of its density is not known.
 
 If an interval between two draws is to have the probability 0.9, its true probability then has a standard error of
 0.003.
@@ -56,9 +56,9 @@ class Interval(NamedTuple):
             one turn further. If the angle covers the whole circle, the circular median splits this arc into two parts
             of equal probability.
         high: the upper end of the interval.
-        low_error: standard error of the lower end, in its unit; 0 where the end was computed without draws, infinite
-            where fewer than 5 draws are expected beyond it.
-        high_error: standard error of the upper end, as `low_error`.
+        low_error: standard error of the lower end, in the unit of the number. The error is 0 where the end was computed
+            without draws, and infinite where fewer than 5 draws are expected beyond the end.
+        high_error: standard error of the upper end, in the unit of the number, with the same special values.
     """
 
     low: Tensor
@@ -109,7 +109,7 @@ def _select(chosen: Tensor, first: Interval, second: Interval) -> Interval:
 
 
 def _exact_interval(low: Tensor, high: Tensor) -> Interval:
-    """Return the interval with the ends `low` and `high`, (*batch,), and with standard errors of 0."""
+    """Return the interval with the ends `low` and `high`, (*batch,), both with a standard error of 0."""
     none = torch.zeros_like(low).unsqueeze(-1)
     return Interval(low.unsqueeze(-1), high.unsqueeze(-1), none, none)
 
@@ -197,15 +197,15 @@ def _quantiles_by_search(
 def find_crossing(
     rising: Callable[[Tensor], Tensor], level: Tensor, low: Tensor, high: Tensor, center: Tensor
 ) -> Tensor:
-    """Return the argument at which a function that never falls reaches `level`; NaN where the function is NaN.
+    """Return the argument x at which a function that never falls reaches `level`; NaN where the function is NaN.
 
-    Each item has its own search. It uses inverse quadratic interpolation where this is safe, and bisection elsewhere
-    (Chandrupatla 1997).
+    All tensors broadcast to one shape, and each element has its own search. The search uses inverse quadratic
+    interpolation where this is safe, and bisection elsewhere (Chandrupatla 1997).
 
     Args:
-        rising: the function, which never falls.
+        rising: the function, which maps a tensor of arguments to a tensor of values of the same shape.
         level: the value that the function reaches.
-        low: lower end of a bracket of the argument.
+        low: lower end of a bracket of x.
         high: upper end of the bracket.
         center: reference point. The search ends where the bracket is as narrow as EXACT times its distance from this
             point, or where its ends are neighbouring floating-point numbers.

@@ -41,10 +41,10 @@ def seed_step(seed: int, step: int, stage: str, rank: int = 0) -> None:
 
     Args:
         seed: seed of the run.
-        step: number of the batch, not of the optimiser's step: batches whose gradients are accumulated would share
-            their noise otherwise.
+        step: number of the batch. The number of the optimiser's step would give batches whose gradients are
+            accumulated the same noise.
         stage: name of what the noise is used for, such as "train" or "validation".
-        rank: number of the process.
+        rank: number of the process, if several processes train one model; 0 for a single process.
     """
     value = stable_hash(seed, stage, step, rank)
     # torch.manual_seed is not used: where CUDA is not in use it formats the stack for a later report, 100 µs.

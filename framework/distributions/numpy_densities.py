@@ -91,7 +91,7 @@ class Density:
         raise ValueError("Only classes have probabilities. Use `log_prob`.")
 
     def log_prob(self, value: Array) -> Array:
-        """Return the log-density at `value` (*sample, *batch, *event), (*sample, *batch), nats."""
+        """Return the log-density, nats, (*sample, *batch), at `value`, (*sample, *batch, *event)."""
         raise NotImplementedError
 
     def sample(self, generator: np.random.Generator, count: int) -> Array:
@@ -284,9 +284,9 @@ def _arc_of_draws(angles: Array, mass: float) -> tuple[float, float, float]:
 
 
 class Cumulative:
-    """The distribution function of a density of one number, by quadrature between the edges of its panels.
+    """The distribution function of a density of one number, by quadrature between the density's `edges`.
 
-    It takes less time than the distribution functions of many components.
+    For a mixture of many components, it takes less time than the distribution functions of all components.
 
     Args:
         density: the density, with event (1,).
@@ -300,7 +300,7 @@ class Cumulative:
         self.mass = np.concatenate([np.zeros_like(mass[:1]), np.cumsum(mass, 0)])
 
     def below(self, value: Array) -> Array:
-        """Return the probability between the first edge and `value` (*sample, *batch), (*sample, *batch)."""
+        """Return the probability between the first edge and `value`; both arrays have the shape (*sample, *batch)."""
         shape = np.broadcast_shapes(value.shape, self.density.batch)
         flat = np.broadcast_to(value, shape).reshape(-1, self.edges.shape[1])
         panel = (flat >= self.edges[1:-1, None]).sum(0)
@@ -312,7 +312,7 @@ class Cumulative:
         return np.clip(np.take_along_axis(self.mass, panel, 0) + part, 0, 1).reshape(shape)
 
     def arc(self, start: Array, end: Array) -> Array:
-        """Return the probability of an arc, as `Density.arc`."""
+        """Return the probability of an arc, counter-clockwise from `start` to `end`, (*sample, *batch)."""
         first = self.edges[0].reshape(self.density.batch)
         low, high = (np.mod(side - first, 2 * math.pi) for side in (start, end))
         inside = self.below(first + high) - self.below(first + low)
@@ -439,7 +439,7 @@ def bessel_i0e(value: Array) -> Array:
 
 
 def log_sum_exp(terms: Array) -> Array:
-    """Return log Σ exp(terms) over the last dimension; -inf if all terms are."""
+    """Return log Σ exp(terms) over the last dimension; -inf if all terms are -inf."""
     largest = terms.max(-1, keepdims=True)
     shift = np.where(np.isfinite(largest), largest, 0.0)
     with np.errstate(divide="ignore"):
@@ -447,7 +447,7 @@ def log_sum_exp(terms: Array) -> Array:
 
 
 def normal_cdf(standard: Array) -> Array:
-    """Return the distribution function of the standard normal density, with the digits of `math.erfc`."""
+    """Return the distribution function of the standard normal density, as accurate as `math.erfc`."""
     argument = np.asarray(standard, dtype=np.float64) / -math.sqrt(2)
     return np.asarray(_erfc(argument), dtype=np.float64) / 2
 

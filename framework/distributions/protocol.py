@@ -188,7 +188,8 @@ class Estimate(NamedTuple):
     """A log-density and its Monte Carlo error; all fields have the same shape and are in nats unless stated otherwise.
 
     Attributes:
-        log_mean: the value of log_prob; its expectation is below the truth by about standard_error²/2 (Jensen).
+        log_mean: the value of log_prob; its expectation is about standard_error²/2 below the exact log-density
+            (Jensen).
         debiased: log_mean + standard_error²/2.
         standard_error: standard error of log_mean, from random draws inside the density; 0 where nothing is drawn, NaN
             where it is not known, infinite where all draws had weight 0.
@@ -277,7 +278,7 @@ def ranked_score(density: Distribution, value: Tensor) -> Tensor | None:
     """Return the continuous ranked probability score of a density of one real number at `value` y (*batch, 1).
 
     The score E|X - y| - ½ E|X - X'| (Gneiting & Raftery 2007, eq. 21) is float64, (*batch), in the unit of the number.
-    The default returns None, because no formula is known. The metric then uses its own formula or draws.
+    The default returns None, because no formula is known. The metric `crps` then uses a formula of its own or draws.
     """
     return None
 
@@ -410,12 +411,15 @@ def peak_widths(density: Distribution) -> Tensor:
 
 
 class QuadraticBound(NamedTuple):
-    """A lower bound of log p that touches log p at one value (see `quadratic_bound`).
+    """A lower bound of log p that touches log p at a value y, as `quadratic_bound` returns it.
+
+    With g = `pull` and h = `stiffness`, the bound at y + d is log p(y) + Σ (g d - h d²/2) for real numbers, and
+    log p(y) + Σ (g sin d - h (1 - cos d)) for angles. The sums are over the numbers of an event.
 
     Attributes:
-        log_prob: log p at this value, (*sample, *batch).
-        pull: gradient of log p at this value, (*sample, *batch, *event).
-        stiffness: curvature of the bound, (*sample, *batch, *event).
+        log_prob: log p(y), (*sample, *batch), nats.
+        pull: gradient of log p at y, (*sample, *batch, *event).
+        stiffness: minus the second derivative of the bound by each number at y, above 0, (*sample, *batch, *event).
     """
 
     log_prob: Tensor
@@ -484,7 +488,7 @@ class ValueSet(ABC):
 
         The batch is flattened. For classes, the parts are labels. For one real number, they are intervals (low, high).
         For one angle, they are arcs (low, high) in radians, from low in [-π, π) counter-clockwise to high, at most one
-        turn further. Predictions print the listed parts. The default returns None, because the set cannot be listed.
+        turn further. `mode=predict` writes the parts. The default returns None, because the set cannot be listed.
         """
         return None
 

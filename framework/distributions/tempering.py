@@ -31,9 +31,12 @@ POINTS, MOST_POINTS = 1024, 2**15
 The number is doubled until the grid resolves the power.
 """
 RESOLVED = 1e-4
-"""Largest difference of log ∫ p^(1/T), nats, between a grid that resolves the power and every second of its angles."""
+"""Largest difference between log ∫ p^(1/T) on a grid and on every second angle of this grid, nats.
+
+If the difference is larger, the grid does not resolve the power.
+"""
 MASS_GAP = 0.01
-"""Largest |log ∫ p| on a grid that resolves p; if it is larger, a peak lies between the grid's angles."""
+"""Largest accepted |log ∫ p| on a grid, nats; if it is larger, a peak of p lies between the grid's angles."""
 HELD = 0.3
 """Probability that a single angle of the grid represents, above which MASS_GAP does not apply.
 
@@ -47,7 +50,7 @@ For a stretch s, half of the grid's angles lie within 2 atan(s) of the mode.
 QUANTILES = 2048
 """Number of angles, besides those of the grid, at which the distribution function is computed for random draws."""
 BROADER = 0.25
-"""Exponent B: the QUANTILES further angles are quantiles of p^(B/T), so that tails and low peaks get angles too."""
+"""Exponent B: the QUANTILES additional angles are quantiles of p^(B/T), so that tails and low peaks get angles too."""
 _log = logging.getLogger(__name__)
 
 
@@ -130,7 +133,7 @@ def divide_by_temperature(log_density: Tensor, temperature: Tensor) -> Tensor:
 
 
 class RescaledClasses(CategoricalDensity):
-    """A density over classes whose log-probabilities are `slope` times those of another density, plus constants.
+    """A density over classes whose log-probabilities are `slope` times those of another density, plus a constant.
 
     Args:
         logits: log-probabilities of this density, up to a constant per item of the batch, (*batch, label).
@@ -181,9 +184,9 @@ class CircularPower(DerivedDensity):
     stretch s. The trapezium rule is spectrally exact on these angles too.
 
     Samples are drawn by the inverse of the distribution function. This function is computed at the angles of the grid
-    and at QUANTILES quantiles of p^(BROADER/T), and the density is taken as linear between these angles. The distance
-    between them is 0.005 standard deviations at the highest point of a peak, and 0.4 at six standard deviations from
-    there.
+    and at QUANTILES quantiles of p^(BROADER/T), and the density is taken as linear between these angles.
+    Neighbouring angles are 0.005 standard deviations of a peak apart at its highest point, and 0.4 standard deviations
+    apart at a distance of six standard deviations from this point.
 
     Args:
         density: p, event_shape (1,), over the whole circle.

@@ -14,7 +14,7 @@ def choose_images(facts: Float[Tensor, "image 2"]) -> list[int]:
     the order of the images. Images without a score (NaN) are left out.
 
     Args:
-        facts: score and data set index of each image.
+        facts: for each image, its score and its index in the data set.
     """
     rows = facts.tolist()
     known = sorted((row for row, (score, _) in enumerate(rows) if score == score), key=rows.__getitem__)

@@ -20,7 +20,7 @@ The larger a residual is beyond c, the less weight it has, so that an outlier ha
 FIRST = 8
 """Number of observed frames from which the start of the search is computed."""
 MOST = torch.tensor([BELIEVED] * 3 + [50.0] * 3 + [1000.0] * 3, dtype=torch.float64)
-"""Largest absolute values of a state: m, m/s, rad/s."""
+"""Largest absolute values of the numbers of a state: position (m), velocity (m/s) and spin (rad/s)."""
 
 
 class ObservedFrames(NamedTuple):

@@ -20,13 +20,17 @@ Vector = tuple[Any, Any, Any]
 
 @dataclass(frozen=True, kw_only=True)
 class Constants:
-    """Constants of a ball and a table; the values are those of the WAM laboratory's simulator if it has them.
+    """Constants of a table-tennis ball and a table.
+
+    The values are those of the simulator of the WAM laboratory, which also published recorded flights, for all
+    constants that this simulator has.
 
     Attributes:
         gravity: m/s².
         drag: k of the deceleration k |v| v, 1/m (Mülling et al. 2011, eq. 1).
-        lift: m of the Magnus acceleration m ω × v, dimensionless: 1/2 ρ A r c / mass with a lift coefficient of 0.6.
-        spin_decay: share of the spin that the air removes per second, 1/s.
+        lift: m of the Magnus acceleration m ω × v, dimensionless: ρ A r c / (2 · mass) with the density ρ of air, the
+            ball's cross-section A and radius r, and the lift coefficient c = 0.6.
+        spin_decay: rate k of the exponential decay of the spin ω, dω/dt = -k ω, 1/s.
         restitution: upward speed after the bounce divided by downward speed before it.
         friction: Coulomb's coefficient of ball and table.
         radius: radius of the ball, m.

@@ -23,7 +23,7 @@ def free_flight(
 
     For 16 ms at 6 m/s its error is below 1e-8 m (tests/test_flight_physics.py). The acceleration is evaluated four
     times per step, as the method requires. The spin decays independently of the motion, so its values at these four
-    evaluations are polynomials of the decay.
+    evaluations are the initial spin times polynomials of decay rate · `time`.
     """
     h = time.unsqueeze(-1)
     place, velocity, spin = state[:, :3], state[:, 3:6], state[:, 6:]
@@ -105,8 +105,8 @@ def simulate_with_jacobian(
     """Return positions, and their derivatives with respect to the state at the start.
 
     The derivatives are central differences, computed for all states at once. In float64 they have nine correct digits
-    (tests/test_flight_physics.py). They take a hundredth of the time of torch's forward mode, which interprets each of
-    about ten thousand small operations.
+    (tests/test_flight_physics.py). They take a hundredth of the time of torch's forward-mode differentiation, which
+    interprets each of about ten thousand small operations.
     """
     flights, time = times.shape
     shift = torch.diag(start.new_tensor([1e-5] * 6 + [1e-3] * 3))

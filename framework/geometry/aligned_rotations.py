@@ -57,36 +57,36 @@ class Frame(NamedTuple):
 
     @property
     def mode(self) -> Float[Tensor, "*batch 4"]:
-        """Quaternion of U Vᵀ, the rotation at which the density is highest."""
+        """Quaternion of U Vᵀ, the rotation at which the matrix Fisher density is highest."""
         return self.turn(self.falls.new_tensor([1.0, 0, 0, 0]))
 
     def turn(self, aligned: Float[Tensor, "... 4"]) -> Float[Tensor, "... 4"]:
-        """Return the quaternion of R from the quaternion of UᵀRV."""
+        """Return the quaternion of a rotation R, given the quaternion `aligned` of the aligned rotation UᵀRV."""
         left, right = quaternions.of_matrix(self.left), quaternions.of_matrix(self.right)
         return quaternions.product(quaternions.product(left, aligned), quaternions.inverse(right))
 
     def aligned(self, turn: Float[Tensor, "... 4"]) -> Float[Tensor, "... 4"]:
-        """Return the quaternion of UᵀRV from the quaternion of R."""
+        """Return the quaternion of the aligned rotation UᵀRV, given the quaternion `turn` of a rotation R."""
         left, right = quaternions.of_matrix(self.left), quaternions.of_matrix(self.right)
         return quaternions.product(quaternions.product(quaternions.inverse(left), turn), right)
 
 
 def log_prob(turn: Float[Tensor, "... 4"], parameter: Float[Tensor, "... 3 3"]) -> Float[Tensor, "..."]:
-    """Return the log-density of rotations, nats, float64; batch shapes broadcast.
+    """Return the matrix Fisher log-density of rotations, nats, float64; batch shapes broadcast.
 
-    The first and second derivatives in both arguments are accurate everywhere, also where singular values are equal or
-    zero: they are moments of the rotation, and are computed without division by a difference of singular values. The
-    derivative in `turn` is only valid for changes that keep the quaternion of unit length.
+    The first and second derivatives in both arguments are accurate everywhere, also where singular values of F are
+    equal or zero: they are moments of the rotation, and are computed without division by a difference of singular
+    values. The derivative in `turn` is only valid for changes that keep the quaternion of unit length.
 
     Args:
         turn: unit quaternions of the rotations.
-        parameter: F.
+        parameter: the matrix F of the density exp(tr(FᵀR)) / c(F).
     """
     return _LogProb.apply(turn.double(), parameter.double())
 
 
 def mean_rotation(parameter: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Return the mean rotation matrix E R = U diag(d) Vᵀ of the density with F = `parameter`, float64.
+    """Return the mean rotation matrix E R = U diag(d) Vᵀ of the matrix Fisher density with F = `parameter`, float64.
 
     The result can be differentiated once. E R is the derivative of log c(F) with respect to F, and d is the mean of the
     diagonal of UᵀRV (Lee 2018, Thm. 1).
@@ -96,7 +96,7 @@ def mean_rotation(parameter: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*bat
 
 @torch.no_grad()
 def entropy(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-    """Return the entropy -E log p = log k(λ) + Σ λᵢ E qᵢ², nats; `falls` are λ.
+    """Return the entropy -E log p = log k(λ) + Σ λᵢ E qᵢ² of a matrix Fisher density with λ = `falls`, nats.
 
     The density is with respect to the rotation-invariant measure of total mass 1. Its entropy is therefore at most 0.
     """
@@ -125,15 +125,16 @@ def align(parameter: Float[Tensor, "*batch 3 3"]) -> Frame:
 
 @torch.no_grad()
 def log_height(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-    """Return -log k(λ), the log-density at the mode, nats, float64; `falls` are λ."""
+    """Return -log k(λ), the log-density at the mode of a matrix Fisher density with λ = `falls`, nats, float64."""
     return -_quadrature(falls)[2].sum(-1).log()
 
 
 @torch.no_grad()
 def second_moments(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """Return E qᵢ² = -∂log k/∂λᵢ for i = 1, 2, 3, each to full relative precision; `falls` are λ.
+    """Return E qᵢ² = -∂log k/∂λᵢ for i = 1, 2, 3, each to full relative precision.
 
-    These moments give the diagonal of E UᵀRV, for example d₁ = 1 - 2(E q₂² + E q₃²).
+    q is the quaternion of the aligned rotation UᵀRV under the matrix Fisher density with λ = `falls`. The moments
+    give the diagonal d of E UᵀRV, for example d₁ = 1 - 2(E q₂² + E q₃²).
     """
     outer, inner, mass = _quadrature(falls)
     mass = mass / mass.sum(-1, keepdim=True)
@@ -145,7 +146,10 @@ def second_moments(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"
 
 @torch.no_grad()
 def fourth_moments(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 4"]:
-    """Return E qᵢ²qⱼ² of the aligned quaternion, i, j = 0, …, 3, to nearly full relative precision; `falls` are λ."""
+    """Return E qᵢ²qⱼ² for i, j = 0, …, 3, to nearly full relative precision.
+
+    q is the quaternion of the aligned rotation UᵀRV under the matrix Fisher density with λ = `falls`.
+    """
     outer, inner, mass = _quadrature(falls)
     mass = mass / mass.sum(-1, keepdim=True)
     blocks = []
@@ -169,7 +173,7 @@ def fourth_moments(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 
 
 @torch.no_grad()
 def sample(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
-    """Return one random aligned quaternion q per element of the batch, float64; `falls` are λ.
+    """Return one random quaternion q of the aligned rotation UᵀRV for each row of `falls`, which are λ; float64.
 
     The method is rejection sampling (Kent, Ganeiber & Mardia 2018, §3).
     The proposal is the angular central Gaussian z/|z| with zᵢ ~ N(0, 1/(1 + 2λᵢ/b)); b solves Σᵢ 1/(b + 2λᵢ) = 1,

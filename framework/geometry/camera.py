@@ -66,7 +66,7 @@ class Camera:
         The pixel has no meaning for a depth that is not above 0. Integers are converted to torch's default float type.
 
         Raises:
-            ValueError: as `check_shapes`.
+            ValueError: `rotation`, `translation`, `focal` or `principal` has a wrong shape.
         """
         camera_points, focal, principal = self._in_camera_frame(points)
         return focal * camera_points[..., :2] / camera_points[..., 2:] + principal, camera_points[..., 2]
@@ -83,7 +83,7 @@ class Camera:
         `focal` and `principal`. Integers are converted to torch's default float type.
 
         Raises:
-            ValueError: as `check_shapes`.
+            ValueError: `rotation`, `translation`, `focal` or `principal` has a wrong shape.
         """
         camera_points, focal, principal = self._in_camera_frame(points)
         plain = canonical_camera(self.height, self.width)
@@ -162,7 +162,7 @@ def look_from(
         size: (height, width), pixels.
 
     Raises:
-        ValueError: as `focal_length`.
+        ValueError: `field_of_view` is not between 0 and π; it may be in degrees.
     """
     height, width = size
     rotation = viewpoint_rotation(torch.tensor([azimuth, elevation, tilt], dtype=torch.float64))

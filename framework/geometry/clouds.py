@@ -21,7 +21,8 @@ Normalisation = Literal["unit_ball", "robust", "none"]
 REACH = 3.0
 """Distance beyond which the normalisation "robust" ignores points for centre and scale.
 
-The distance is measured from the point that has the medians as coordinates, in multiples of the median distance.
+The distance is measured from the point with the median x, median y and median z of the cloud, in multiples of the
+median distance of the cloud's points from it.
 """
 LOOSE, TIGHT = 2.0, 0.01
 """Largest and smallest extent of a normalised cloud, in multiples of the extent of the basis or grid that describes it.
@@ -151,7 +152,8 @@ def normalise_clouds(
         counts: number of points of each cloud, as `sizes` returns them; None if they are not known yet.
 
     Raises:
-        DataError: as `sizes`; or squared distances within a cloud exceed float64.
+        DataError: a cloud has no points, a number of a point is not finite, or squared distances within a cloud exceed
+            float64.
     """
     if counts is None:
         counts = sizes(clouds)
@@ -270,8 +272,8 @@ def denormalise_clouds(
 
     Args:
         points: normalised points, (batch, points, columns).
-        centre: centre of each cloud, as in `NormalisedClouds`.
-        scale: scale of each cloud, as in `NormalisedClouds`.
+        centre: centre of each cloud, in the cloud's own units.
+        scale: factor from normalised to own coordinates of each cloud.
     """
     back = points[..., :3] * scale[:, None, None] + centre[:, None]
     return torch.cat([back.to(points.dtype), points[..., 3:]], -1)

@@ -85,8 +85,8 @@ def line_numbers(
 
     Args:
         content: bytes of the file.
-        comment: as for `text_lines`.
-        names: as for `text_lines`.
+        comment: sign at which a comment begins; None if there are no comments.
+        names: first words of lines that are kept whole.
         key: if not empty, only lines with this first word are counted.
         first: number of counted lines before the line with index 0.
     """
@@ -297,7 +297,8 @@ def from_zero(
     """Return indices (from 0) of the vertices or other elements to which the faces of an OBJ file refer.
 
     Args:
-        numbers: numbers in the file: from 1 on, or negative, where -1 is the last element above the face. 0 gives -1.
+        numbers: numbers in the file: from 1 on, or negative, where -1 is the last element above the face. The invalid
+            number 0 gives the index -1.
         before: number of elements above each face in the file.
         counts: number of corners of each face.
     """

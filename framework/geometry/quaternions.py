@@ -15,7 +15,7 @@ Quaternions = Float[Tensor, "... 4"]
 
 
 def product(first: Quaternions, second: Quaternions) -> Quaternions:
-    """Return the quaternion of the rotation `first` after the rotation `second`; batch shapes broadcast."""
+    """Return the quaternion of the rotation that rotates by `second` and then by `first`; batch shapes broadcast."""
     a, b, c, d = first.unbind(-1)
     e, f, g, h = second.unbind(-1)
     return torch.stack(

@@ -19,21 +19,21 @@ from torch import Tensor
 from framework.geometry import quaternions
 
 SMALLEST = 72
-"""Number of cells of the coarsest grid: 12 pixels times 6 arcs."""
+"""Number of cells of the coarsest grid: 12 HEALPix pixels of directions times 6 arcs of a circle."""
 OFFSET = 0.05
 """Angle by which the grid is turned in azimuth and tilt, radians.
 
 Without it, angles of 0° and 90°, which many data contain, would lie on borders of cells.
 """
 SUBDIVISION = 32
-"""Number of parts of a pixel along each side for the mean of log cos e over the pixel."""
+"""Number of parts into which each side of a pixel is divided to compute the mean of log cos e over the pixel."""
 
 
 def level_of(cells: int) -> int:
-    """Return n for a grid of 72 · 8ⁿ cells, n from 0 to 5.
+    """Return the level n, from 0 to 5, of the grid with `cells` = 72 · 8ⁿ cells.
 
     Raises:
-        ValueError: there is no such n.
+        ValueError: no level has this number of cells.
     """
     for level in range(6):
         if cells == SMALLEST * 8**level:
@@ -44,20 +44,22 @@ def level_of(cells: int) -> int:
 
 @cache
 def centres(cells: int) -> Float[Tensor, "cells 3"]:
-    """Return azimuth, elevation and tilt at the centre of each cell, radians, float64."""
+    """Return azimuth, elevation and tilt of each cell's centre in the grid with `cells` cells, radians, float64."""
     index = torch.arange(cells)
     half = torch.full((cells,), 0.5, dtype=torch.float64)
     return points_in(index, half, half, half, cells)
 
 
 def points_in(index: Int[Tensor, "..."], x: Tensor, y: Tensor, along: Tensor, cells: int) -> Tensor:
-    """Return a point of each cell, azimuth, elevation and tilt, (..., 3) float64.
+    """Return a point in each given cell of the grid: azimuth, elevation and tilt, radians, (..., 3) float64.
+
+    A cell is a HEALPix pixel of the sphere of directions times an arc of the circle of the third coordinate.
 
     Args:
-        index: number of the cell.
-        x: place in the pixel along its first side, from 0 to 1.
-        y: place in the pixel along its second side, from 0 to 1.
-        along: place in the arc, from 0 to 1.
+        index: number of the cell, from 0 to `cells` - 1.
+        x: position of the point along the first side of the pixel, from 0 to 1.
+        y: position of the point along the second side of the pixel, from 0 to 1.
+        along: position of the point along the arc, from 0 to 1.
         cells: number of cells of the grid.
     """
     side, arcs = 2 ** level_of(cells), 6 * 2 ** level_of(cells)
@@ -71,7 +73,10 @@ def points_in(index: Int[Tensor, "..."], x: Tensor, y: Tensor, along: Tensor, ce
 
 
 def cell_of(angles: Float[Tensor, "... 3"], cells: int) -> Int[Tensor, "..."]:
-    """Return the number of the cell of each rotation, given by azimuth, elevation and tilt, radians."""
+    """Return the number of the cell, in the grid with `cells` cells, that contains each rotation.
+
+    `angles` are azimuth, elevation and tilt of the rotations, radians.
+    """
     azimuth, elevation, tilt = quaternions.to_viewpoint(quaternions.of_viewpoint(angles.double())).unbind(-1)
     azimuth, tilt = azimuth - OFFSET, tilt - OFFSET
     side, arcs = 2 ** level_of(cells), 6 * 2 ** level_of(cells)
@@ -86,7 +91,7 @@ def cell_of(angles: Float[Tensor, "... 3"], cells: int) -> Int[Tensor, "..."]:
 
 @cache
 def mean_log_cosine(cells: int) -> Float[Tensor, "cells"]:
-    """Return the mean of log cos e over each cell, float64, with an error below 1e-4."""
+    """Return the mean of log cos(elevation) over each cell of the grid with `cells` cells, with an error below 1e-4."""
     side, arcs = 2 ** level_of(cells), 6 * 2 ** level_of(cells)
     place = (torch.arange(SUBDIVISION, dtype=torch.float64) + 0.5) / SUBDIVISION
     x, y = torch.meshgrid(place, place, indexing="ij")

@@ -82,9 +82,10 @@ def tube(path: Sequence[Point] | np.ndarray, radii: Sequence[Number], sides: int
 def bar(
     start: Points, end: Points, radius: Number, end_radius: Number | None = None, sides: int = 6
 ) -> Solid:
-    """Return a round bar with sharp rims, or a frustum of a cone if `end_radius` differs from `radius`.
+    """Return a round bar with sharp rims between the points `start` and `end`.
 
-    With at most 6 `sides`, the edges between the sides are sharp too.
+    The bar is a frustum of a cone if its radius at the end, `end_radius`, differs from `radius`. With at most
+    6 `sides`, the edges between the sides are sharp too.
     """
     first, last = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     x, y, z = (last - first).tolist()
@@ -109,10 +110,14 @@ def wheel(center: Points, radius: Number, width: Number, sides: int = 16) -> Sol
 
 
 def torus(center: Points, radius: Number, thickness: Number, sides: int = 20, around: int = 5) -> Solid:
-    """Return a torus whose axis is parallel to x.
+    """Return a torus whose axis is parallel to x; its faces run clockwise seen from outside.
 
-    `radius` is the distance from the axis to the middle of the tube, and `thickness` the diameter of the tube. The
-    faces run clockwise seen from outside.
+    Args:
+        center: centre of the torus.
+        radius: distance from the axis to the middle of the tube.
+        thickness: diameter of the tube.
+        sides: number of cross-sections along the tube.
+        around: number of points of a cross-section.
     """
     out, along = _circle(sides), _circle(around)
     distance = radius + thickness / 2 * along[:, 0]
@@ -130,7 +135,11 @@ def _torus_faces(sides: int, around: int) -> Int[np.ndarray, "faces 3"]:
 
 
 def ellipsoid(center: Points, radii: Points, sides: int = 14, layers: int = 9) -> Solid:
-    """Return an ellipsoid with centre `center` and half axes `radii` along x, y, z."""
+    """Return an ellipsoid with centre `center` and half axes `radii` along x, y, z.
+
+    The surface runs through `layers` horizontal rings with `sides` points each; the first and the last ring shrink to
+    points.
+    """
     angle = np.linspace(-np.pi / 2, np.pi / 2, layers)
     unit = revolution(np.stack([np.cos(angle), np.sin(angle)], axis=1), sides, "rims")
     return unit.scale(*radii).move(*center)

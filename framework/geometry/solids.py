@@ -133,7 +133,7 @@ def _levels(levels: Sequence[tuple[np.ndarray, Number]], caps: bool = True) -> S
 
     Args:
         levels: (outline (points, 2), height) of each ring.
-        caps: as for `loft`.
+        caps: if true, fans of triangles close the first and the last ring.
     """
     return loft([np.insert(outline, 2, z, axis=1) for outline, z in levels], caps=caps)
 

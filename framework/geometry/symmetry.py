@@ -1,4 +1,4 @@
-"""Groups of rotations that leave a solid unchanged, the distance to the nearest equivalent rotation, blurred labels.
+"""Groups of rotations that leave a solid unchanged: nearest equivalent rotations, and rotations with random noise.
 
 A solid that its group G leaves unchanged looks the same in the rotations R and R g for all g in G, so that an image
 shows only the coset R G. Rotations are unit quaternions as in `framework.geometry.quaternions`.
@@ -61,7 +61,7 @@ def rotations_of(group: str) -> Float[Tensor, "rotation 4"]:
 def nearest_distance(
     first: Float[Tensor, "... 4"], second: Float[Tensor, "... 4"], group: str
 ) -> Float[Tensor, "..."]:
-    """Return the smallest angle between the rotation `second` and any rotation `first` g with g in the group, radians.
+    """Return the smallest angle between the rotation `second` and the rotations `first` g, g in the group, radians.
 
     Batch shapes broadcast.
     """
@@ -78,10 +78,10 @@ def nearest_distance(
 
 
 def noise_concentration(deviation: float) -> float:
-    """Return κ of the noise density exp(2κ cos ω) / c of a rotation by ω, for a small standard deviation, radians.
+    """Return κ of the density exp(2κ cos ω) / c of a random rotation by the angle ω about a uniformly random axis.
 
-    The noise is the matrix Fisher density with F = κI: its axis is uniform. For a small deviation σ about each of the
-    three axes, exp(2κ cos ω) is near exp(2κ - κω²), so that κ = 1/(2σ²).
+    This is the matrix Fisher density with F = κI. `deviation` is the standard deviation σ of the rotation about each of
+    x, y and z, radians. For a small σ, exp(2κ cos ω) is near exp(2κ - κω²), so that κ = 1/(2σ²).
     """
     return 1 / (2 * deviation**2)
 
@@ -99,7 +99,7 @@ def log_blurred(
 
         ∫ exp(2κ (cos²(β/2) (1 + cos θ) - 1)) dθ/2π / c = exp(-2κ sin²(β/2)) I₀(2κ cos²(β/2)) / c.
 
-    With half turns across z, it is the mean of this function at β and at π - β.
+    For the group with half turns across z too, the density is the mean of this function at β and at π - β.
     """
     relative = quaternions.product(quaternions.inverse(first.double()), second.double())
     double = torch.tensor(2 * concentration, dtype=torch.float64)
@@ -125,8 +125,8 @@ def log_blurred(
 def draw_noise(count: int, concentration: float, generator: torch.Generator | None = None) -> Tensor:
     """Return `count` random rotations with the density of `noise_concentration`, quaternions, float64.
 
-    The axis is uniform, and the angle ω has the density sin²(ω/2) exp(-4κ sin²(ω/2)) up to a constant. The inverse of
-    its distribution function is interpolated on a fine grid.
+    The axis is uniform. With κ = `concentration`, the angle ω has the density sin²(ω/2) exp(-4κ sin²(ω/2)) up to a
+    constant. The inverse of its distribution function is interpolated on a fine grid.
     """
     root = torch.linspace(0, 1, 200_001, dtype=torch.float64)
     most = min(1.0, math.sqrt(45 / (4 * concentration)))

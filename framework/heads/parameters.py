@@ -18,8 +18,8 @@ def require_finite(raw: Tensor, shape: int | tuple[int, ...]) -> Tensor:
 
     Raises:
         ValueError: the last dimensions are not `shape`.
-        NonFiniteParameters: a number is not finite; it is also a ValueError, and its message names the first such batch
-            row.
+        NonFiniteParameters: a number is not finite. This error is also a ValueError, and its message names the first
+            such row of the batch.
     """
     own = (shape,) if isinstance(shape, int) else shape
     if raw.shape[-len(own) :] != own:
@@ -60,8 +60,9 @@ def require_trained(component: DensityHead) -> DensityHead:
     """Return the component itself if all its parameters are trained by gradient.
 
     Raises:
-        ConfigError: the component fits parameters after training, but it cannot know which samples belong to it; or it
-            requires backbones, which only the head of a model has; or it reads an image.
+        ConfigError: the component fits parameters after training, but it cannot know which samples belong to it. Or the
+            component requires backbones (separate networks for its parts), which only the head of a model has. Or
+            the component reads an image.
     """
     if len(component.raw_shape) != 1:
         raise ConfigError(

@@ -9,9 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 GRID = 64
-"""Number of cells in which peaks are searched."""
+"""Number of equal cells into which the interval is divided for the search of peaks."""
 PEAKS = 2
-"""Largest number of peaks that have nodes of their own, the highest ones."""
+"""Largest number of peaks that have nodes of their own; if there are more, these are the highest peaks."""
 ROUNDS = 14
 """Number of rounds that refine a peak.
 

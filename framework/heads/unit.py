@@ -12,7 +12,8 @@ from framework.target import Target
 class Unit(NamedTuple):
     """Location and scale of each number of a target, (number,), in double precision.
 
-    Location and scale are None if the head computes in the target's own unit.
+    A head computes with (number - location) / scale. Location and scale are None if the head computes in the target's
+    own unit.
     """
 
     location: Tensor | None
@@ -59,17 +60,17 @@ class Unit(NamedTuple):
 
 
 class HeadOfReals(DensityHead):
-    """Base class of heads that compute in the unit of standard deviations, with scales above a floor.
+    """Base class of heads that predict real numbers as multiples of the standard deviations of the training targets.
 
     Args:
         target: the predicted quantity, real numbers.
         by: name of the head, for the message about a target of another kind.
-        floor: smallest scale, as below.
+        floor: smallest scale of a predicted density, in standard deviations of the training targets.
 
     Attributes:
         numbers: number of real numbers in the target.
-        floor: smallest scale, in the unit of the raw parameters.
-        unit: unit of the target, in which raw parameters are relative to the training targets.
+        floor: the argument `floor`.
+        unit: location and scale of each number, which convert between standard deviations and the target's own unit.
     """
 
     def __init__(self, target: Target, by: str, floor: float) -> None:

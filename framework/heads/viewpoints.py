@@ -30,8 +30,9 @@ SUMMITS = 6
 def log_volume(elevation: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Return log(cos e / 8π²), nats: the log-density of uniform rotations, per radian of each angle.
 
-    The log-density of a viewpoint is log p(R) plus this, for p with respect to the rotation-invariant measure of total
-    mass 1. `elevation` is in radians; outside ±π/2 it is read as the elevation of the same rotation inside.
+    The log-density of a viewpoint is log p(R) plus this number, for a density p of its rotation R with respect to the
+    rotation-invariant measure of total mass 1. `elevation` is in radians; an elevation outside ±π/2 is replaced by
+    the one inside that describes the same rotation.
     """
     return torch.log(torch.cos(elevation).abs()) - math.log(VOLUME)
 

@@ -16,10 +16,7 @@ EPSILON = float(np.finfo(np.float64).eps)
 LEAST_DAMPING, MOST_DAMPING = 1e-30, 1e20
 """Smallest and largest damping."""
 SLIGHT = 1e-2
-"""Damping up to which a step is as good as an undamped one, as a multiple of the Cholesky factor's smallest pivot².
-
-With still less damping, a step would not lower the cost further.
-"""
+"""Damping below which less damping gives no better step, as a multiple of the Cholesky factor's smallest pivot²."""
 QUIET = 4
 """Number of successive steps that end a problem if their gain is negligible or smaller than rounding errors."""
 SINGULAR = 1e-7
@@ -29,7 +26,7 @@ CLIPS = 3
 NEAR = 0.1
 """Largest share of the cost that a step may remove if the minimum is to count as near after the step."""
 GOES_ON, LIMIT, STEP, COST, GRADIENT = 10, 0, 3, 2, 1
-"""Value of `ended`: GOES_ON for a problem that has not ended, else one of framework.least_squares.solution.Status."""
+"""Values of `ended` in `judge_steps`: GOES_ON for a problem that has not ended, else a value of `solution.Status`."""
 
 
 @compiled
@@ -194,23 +191,23 @@ def judge_steps(
     """Accept or reject the step of every problem, and update the state of the problem accordingly.
 
     Args:
-        at: parameters, as for `compute_steps`; updated.
-        cost: as for `compute_steps`; updated.
-        gradient: as for `compute_steps`; updated.
-        gram: as for `compute_steps`; updated.
-        curve: as for `compute_steps`; set to 0 if the step is accepted.
-        scale: as for `compute_steps`; updated.
-        damping: as for `compute_steps`; updated.
+        at: parameters, (problem, p); updated.
+        cost: half the sum of squared residuals, (problem,); updated.
+        gradient: Jᵀr, (problem, p); updated.
+        gram: JᵀJ, (problem, p, p); updated.
+        curve: difference between the Hessian of the cost and JᵀJ, (problem, p, p); set to 0 if the step is accepted.
+        scale: largest length so far of each column of J, (problem, p); updated.
+        damping: damping in units of the square of `scale`, (problem,); updated.
         streak: number of successive steps that lowered the damping, or minus the number of successive rejected steps,
             (problem,); updated.
         quiet: number of successive steps with a gain that is negligible or smaller than rounding errors, (problem,);
             updated.
         steps: number of steps tried, (problem,); updated.
-        move: step, as `compute_steps` filled it, and so are the next four arguments.
-        gain: expected decrease of the cost.
-        slope: largest cosine of the angle between the residuals and a column of J.
-        least: square of the smallest pivot of the Cholesky factor.
-        cut: true where a bound made the step shorter.
+        move: step, (problem, p); `compute_steps` fills `move` and the next four arguments.
+        gain: expected decrease of the cost, (problem,).
+        slope: largest cosine of the angle between the residuals and a column of J, (problem,).
+        least: square of the smallest pivot of the Cholesky factor, (problem,).
+        cut: true where a bound made the step shorter, (problem,).
         tried: parameters after the step, (problem, p).
         new_cost: cost at `tried`.
         new_gradient: gradient at `tried`.

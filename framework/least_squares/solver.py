@@ -23,8 +23,9 @@ With a smaller trace, the matrix is assumed to have full rank.
 Model = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """`model(parameters (active, p), rows (active,)) -> (residuals (active, r), jacobian (active, r, p))`.
 
-`rows` are the numbers of the problems. Residuals that are NaN at the start are missing, and are left out for the whole
-search.
+A call evaluates `active` problems, those that are being solved, each with p parameters and r residuals. `rows` are the
+numbers of these problems among all problems. Residuals that are NaN at the start are missing, and are left out for the
+whole search.
 """
 Normal = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
 """`normal(parameters, rows) -> (cost, gradient Jᵀr, gram JᵀJ, number of residuals)`.
@@ -192,9 +193,9 @@ def least_squares(
         normal: the sums of the model, see `Normal`; the model is then evaluated only if a matrix is close to singular.
         curvature: the second derivatives, see `Curvature`.
         most: largest number of steps tried for each problem.
-        decrease: smallest relative decrease of the cost, see `Status`.
-        step: smallest relative step, see `Status`.
-        damping: damping at the first step, in squared lengths of the Jacobian's columns.
+        decrease: the search ends if no step would lower the cost by more than this share of the cost.
+        step: the search ends if no step would move the parameters by more than this share of their size.
+        damping: damping at the first step, as a multiple of the squared lengths of the Jacobian's columns.
         together: number of problems that are solved at once.
 
     Raises:

@@ -136,10 +136,12 @@ def nearest(
 
 
 def nearest_in_trace(clouds: Tensor, queries: Tensor, sizes: Tensor | None) -> Nearest:
-    """Return the same as `nearest`, computed only by operations that exist in ONNX.
+    """Return the nearest point of each cloud to each query, computed only by operations that exist in ONNX.
 
-    The squared distance |x|² - 2 x·q + |q|² is computed in float64 as products of matrices, so that the distance of
-    points in the unit ball is exact to 1e-7. Few queries at a time keep the products in a CPU's cache.
+    The arguments are those of `nearest`.
+
+    The squared distance |x|² - 2 x·q + |q|² is computed in float64 as products of matrices, so that distances
+    in the unit ball are exact to 1e-7. Few queries at a time keep the products in a CPU's cache.
     """
     points = clouds.double()
     real = point_mask(clouds, sizes)
@@ -349,8 +351,8 @@ def chamfer(
         sizes_b: number of points of each cloud in `b`; None if all rows are points.
 
     Raises:
-        DataError: as `nearest`; or the dtype cannot hold the mean of the squares, because it is too large, or too small
-            and not 0.
+        DataError: a cloud is empty, a number is not finite, or the dtype cannot hold a distance or the mean of the
+            squares; the message names the cloud.
     """
     forward_offsets, backward_offsets = offsets(a, b, sizes_a, sizes_b), offsets(b, a, sizes_b, sizes_a)
     distance = mean_square(forward_offsets, sizes_a) + mean_square(backward_offsets, sizes_b)

@@ -18,7 +18,7 @@ def nearest_of(
     query_sizes: Int[Tensor, "batch"] | None,
     pairs: int = PAIRS,
 ) -> tuple[Float[Tensor, "batch query"], Int[Tensor, "batch query"]]:
-    """Return distance and index as in `framework.geometry.nearest.Nearest`, for finite coordinates.
+    """Return the distance of each query to the nearest point, and the row of this point, for finite coordinates.
 
     Differences are computed before they are squared, because |p|² - 2 p·q + |q|² would lose the digits of small
     distances. Each square is rounded before it is added, while the search on the CPU adds it unrounded (fused

@@ -169,9 +169,9 @@ def extent(cloud, size, box):
     """Write the lowest and highest x, y, z of a cloud to `box` (6,); return false if a number is NaN or infinite.
 
     Args:
-        cloud: flat array.
+        cloud: coordinates of the points, x y z x y z …, (3 · points,).
         size: number of points.
-        box: filled.
+        box: filled with the lowest x, y, z and then the highest x, y, z.
     """
     real = cloud.dtype.type
     low0 = splat(real(np.inf))
@@ -230,7 +230,7 @@ def histogram(cloud, box, bits, begin, end, key, count):
     """Write the cells of the points begin…end to `key`, and the number of these points in each cell to `count`.
 
     Args:
-        cloud: flat array.
+        cloud: coordinates of the points, x y z x y z …, (3 · points,).
         box: lowest and highest coordinates of the whole cloud.
         bits: the grid has 2^bits cells along each axis.
         begin: index of the first point, a multiple of 16.
@@ -266,7 +266,7 @@ def places(count, bits, cells, crowded):
     Args:
         count: number of points that each thread counted in each cell, (threads, cells); replaced by the positions.
         bits: the grid has 2^bits cells along each axis.
-        cells: cells in the order of the Hilbert curve, as `curve` returns them.
+        cells: table from `curve`, the cells of each grid in the order of the Hilbert curve.
         crowded: filled with begin and end of each cell with more than CROWD points.
 
     Returns:
@@ -295,7 +295,7 @@ def scatter(cloud, size, begin, end, key, count, points, ids):
     """Write points begin…end as records x y z id to the positions of their cells; points of a cell keep their order.
 
     Args:
-        cloud: flat array.
+        cloud: coordinates of the points, x y z x y z …, (3 · points,).
         size: number of points of the cloud.
         begin: index of the first point.
         end: index after the last point.
@@ -326,7 +326,7 @@ def sort_crowded(points, crowded, crowded_count, cells):
         points: records x y z id, sorted in place.
         crowded: begin and end of each crowded cell; used as a stack.
         crowded_count: number of crowded cells.
-        cells: cells in the order of the Hilbert curve, as `curve` returns them.
+        cells: table from `curve`, the cells of each grid in the order of the Hilbert curve.
     """
     largest = 0
     for i in range(crowded_count):
@@ -441,10 +441,10 @@ def pack(cloud, size, box, cells, bench, packed):
     """Pack a cloud in one thread.
 
     Args:
-        cloud: flat array.
+        cloud: coordinates of the points, x y z x y z …, (3 · points,).
         size: number of points.
         box: lowest and highest coordinates, as computed by `extent`.
-        cells: cells in the order of the Hilbert curve, as `curve` returns them.
+        cells: table from `curve`, the cells of each grid in the order of the Hilbert curve.
         bench: working memory.
         packed: filled with the packed cloud.
     """

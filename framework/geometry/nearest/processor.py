@@ -112,7 +112,7 @@ def search_clouds(problem, begin, end, cells, work, packed, own):
         problem: the batch.
         begin: index of the first cloud.
         end: index after the last cloud.
-        cells: cells in the order of the Hilbert curve, as `curve` returns them.
+        cells: table from `pack.curve`, the cells of each grid in the order of the Hilbert curve.
         work: working memory of packing.
         packed: memory for a packed cloud.
         own: memory for the packed queries of a cloud.
@@ -159,10 +159,10 @@ def search_clouds_share(problem, counter, step, limit, cells, work, packed, own)
         counter: index of the next cloud, (1,) int64, which all threads share and increase.
         step: number of clouds that a thread takes at a time.
         limit: number of clouds after which this call ends.
-        cells: as for `search_clouds`.
-        work: as for `search_clouds`.
-        packed: as for `search_clouds`.
-        own: as for `search_clouds`.
+        cells: table from `pack.curve`, the cells of each grid in the order of the Hilbert curve.
+        work: working memory of packing.
+        packed: memory for a packed cloud.
+        own: memory for the packed queries of a cloud.
     """
     batch = problem.sizes.shape[0]
     searched = 0
@@ -184,8 +184,8 @@ def search_share(packed, packets, counter, step, distance, index):
         packets: packed queries.
         counter: index of the next packet, (1,) int64, which all threads share and increase.
         step: number of packets that a thread takes at a time.
-        distance: filled as by `search.search`.
-        index: filled as by `search.search`.
+        distance: filled with the distance of the nearest point to each query, at the row of the query.
+        index: filled with the row of this point in the cloud, at the row of the query.
     """
     number = packets.levels[8]
     while True:
@@ -198,16 +198,16 @@ def search_share(packed, packets, counter, step, distance, index):
 @compiled
 @no_type_check
 def search_all_share(cloud, size, packets, counter, step, distance, index):
-    """Do the same as `search_share` for a cloud that is not packed.
+    """Find the nearest points to a part of the packets in one thread, in a cloud that is not packed.
 
     Args:
-        cloud: coordinates of the points, flat array.
+        cloud: coordinates of the points, x y z x y z …, (3 · points,).
         size: number of points.
-        packets: as for `search_share`.
-        counter: as for `search_share`.
-        step: as for `search_share`.
-        distance: as for `search_share`.
-        index: as for `search_share`.
+        packets: packed queries.
+        counter: index of the next packet, (1,) int64, which all threads share and increase.
+        step: number of packets that a thread takes at a time.
+        distance: filled with the distance of the nearest point to each query, at the row of the query.
+        index: filled with the row of this point in the cloud, at the row of the query.
     """
     number = packets.levels[8]
     while True:
@@ -392,7 +392,7 @@ def solve_one(problem: Problem, i: int, cells: NDArray[np.int32], threads: int) 
     Args:
         problem: the batch, with packed queries; its distances, indices and outcome of cloud i are filled.
         i: index of the cloud in the batch.
-        cells: cells in the order of the Hilbert curve, as `curve` returns them.
+        cells: table from `pack.curve`, the cells of each grid in the order of the Hilbert curve.
         threads: number of threads.
     """
     cloud, size = problem.clouds[i], int(problem.sizes[i])
@@ -430,7 +430,7 @@ def extent_together(cloud: Array, size: int, threads: int) -> Array | None:
     """Return the box that `pack.extent` computes, with several threads; None if a number is not finite.
 
     Args:
-        cloud: flat array.
+        cloud: coordinates of the points, x y z x y z …, (3 · points,).
         size: number of points.
         threads: number of threads.
     """
@@ -452,10 +452,10 @@ def pack_together(
     """Pack a cloud in several threads; each thread counts, and then stores, its share of the points.
 
     Args:
-        cloud: flat array.
+        cloud: coordinates of the points, x y z x y z …, (3 · points,).
         size: number of points.
         box: lowest and highest coordinates, as computed by `extent`.
-        cells: cells in the order of the Hilbert curve, as `curve` returns them.
+        cells: table from `pack.curve`, the cells of each grid in the order of the Hilbert curve.
         work: working memory for as many threads.
         packed: filled with the packed cloud.
         threads: number of threads.

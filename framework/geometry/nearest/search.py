@@ -40,9 +40,10 @@ from framework.geometry.lanes import (
 from framework.geometry.nearest.compiled import compiled, inlined
 
 ALONE = 3
-"""Largest number of the sixteen queries for which a node that they need is searched query by query.
+"""Largest number of queries, of the sixteen in a packet, that search a node one after the other.
 
-ALONE_IN_LEAF is the same number for leaves. Both were found by measurement.
+If more of the sixteen queries need the node, they search it together. ALONE_IN_LEAF is the same number for leaves. Both
+numbers were found by measurement.
 """
 ALONE_IN_LEAF = 8
 HIGH = 3
@@ -182,9 +183,9 @@ def search_alone(packed, level, node, query, best, leaf, opened, gaps):
         packed: the cloud.
         level: level of the node's children.
         node: index of the node within the level above.
-        query: x, y, z.
+        query: coordinates x, y, z of the query.
         best: smallest squared distance so far.
-        leaf: leaf in which it was found.
+        leaf: leaf in which the point at this distance was found.
         opened: working memory: open children of each level.
         gaps: working memory: distances of the children of each level.
 
@@ -310,7 +311,7 @@ def open_node(box, nodes, start, valid, low, high, query, best, worst, near, at)
         best: smallest squared distance of each query so far.
         worst: largest of these distances.
         near: filled with the squared distances of the children from each query, from index `at` on.
-        at: index in `near`.
+        at: index in `near` of the first distance.
     """
     zero = splat(box.dtype.type(0))
     close = bits(to_boxes(box, nodes, start, low, high, zero) <= splat(worst)) & valid
@@ -476,13 +477,13 @@ def search_all(cloud, size, packets, begin, end, distance, index):
     This is faster for small clouds or few queries.
 
     Args:
-        cloud: coordinates of the points, flat array.
+        cloud: coordinates of the points, x y z x y z …, (3 · points,).
         size: number of points.
         packets: packed queries.
         begin: index of the first packet.
         end: index after the last packet.
-        distance: as for `search`.
-        index: as for `search`.
+        distance: filled with the distance for each query, at the id of the query.
+        index: filled with the row of the nearest point for each query, at the id of the query.
     """
     queries = packets.points
     blocks = (size + 15) // 16

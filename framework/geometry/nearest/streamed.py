@@ -26,7 +26,8 @@ class Streamed(NamedTuple):
     """The nearest point of each query in a cloud that was read in chunks.
 
     Attributes:
-        distance, index: as in `framework.geometry.nearest.Nearest`; the index counts the points of all chunks.
+        distance: Euclidean distance, in the unit and the dtype of the coordinates.
+        index: number of the nearest point among the points of all chunks, from 0, int64.
         point: the nearest point, with all its columns.
     """
 
@@ -54,8 +55,8 @@ class Stream:
         """Search one more chunk.
 
         Raises:
-            DataError: as `nearest`, or the chunk has another number of columns than the first one; the results so far
-                are then unchanged.
+            DataError: a number is not finite, the dtype cannot hold a distance, or the chunk has another number of
+                columns than the first one. The results so far are then unchanged.
         """
         chunk = chunk.detach()
         if len(chunk) == 0:
@@ -136,7 +137,11 @@ class Middle:
 
 
 class Reach:
-    """The largest distance of a point of all chunks so far from a centre, in float64."""
+    """The largest distance from a centre to a point of the chunks so far, in float64.
+
+    Args:
+        centre: coordinates of the centre, (3,).
+    """
 
     def __init__(self, centre: Float[Tensor, "3"]) -> None:
         self.centre = centre.detach().double().clone()
