@@ -206,8 +206,9 @@ class Data(ABC):
     def frame(self, batch: Batch) -> Frame | None:
         """Return the affine map (`Frame`) that converts targets and predictions of a batch to the user's unit.
 
-        A data set of real targets overrides this if each target is given relative to its own input, such as a
-        normalised cloud. The default, None, means that targets are in the user's unit.
+        A data set of real targets overrides this if the origin and the unit of each target depend on its input, for
+        example on the centre and the size of a point cloud. The default, None, means that targets are in the user's
+        unit.
         """
         return None
 

@@ -58,7 +58,7 @@ class Metric(torchmetrics.Metric, ABC):
     def compute(self) -> dict[str, Tensor]:
         """Return scalars by name, with the unit in the name if it is not 1 (`maad_deg`; `log_likelihood` is in nats).
 
-        They are NaN if no batch was seen.
+        All scalars are NaN if no batch was seen.
         """
 
 

@@ -58,7 +58,8 @@ class Model(Predictor):
         encoders: the encoders, in the order in which they are applied.
         head: the density head.
         input_shape: shape of one sample; needed if there are no encoders.
-        beside: the encoders of all backbones but the first, for a head with several backbones.
+        beside: for a head with several backbones (`DensityHead.backbones`), the chain of encoders of each backbone but
+            the first.
 
     Raises:
         ConfigError: the last encoder's features are not a vector; or, before a direct head, they are not as many as the
@@ -199,7 +200,7 @@ Computed = TypeVar("Computed")
 
 
 class SharedResult(Generic[Computed]):
-    """Cache of the last computed result and of the tensor from which it was computed; empty outside of `one_pass`."""
+    """Cache of the last result and of the inputs from which it was computed; empty outside of a block `one_pass`."""
 
     last: tuple[()] | tuple[Tensor, Computed] | None = None
 

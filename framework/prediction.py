@@ -28,10 +28,10 @@ class Prediction:
     """A batch and the density that is predicted for it.
 
     Args:
-        density: with batch_shape (batch,).
+        density: predicted density of each sample, with batch_shape (batch,).
         batch: the fields of the batch, on the density's device.
         samples: number of samples for a point prediction that has no closed form (S of thesis eq. 3.24).
-        split: source of the batch; the targets of outliers have no meaning.
+        split: "test" for a batch of the test split, "outliers" for a batch of outliers, whose targets have no meaning.
         draw: source of random numbers; None uses the current state of torch's generators.
         reads: channels of images that will be requested, so that they are drawn together.
     """
@@ -74,7 +74,8 @@ class Prediction:
     def estimate(self) -> Estimate:
         """Log-likelihood of the targets with its Monte Carlo error and number of samples.
 
-        The error is 0 if log_prob draws no samples, and NaN if it is not known.
+        The Monte Carlo error is a standard error, nats. It is 0 if log_prob draws no samples, and NaN if it is not
+        known.
         """
         with self._draw("estimate"):
             return estimate(self.density, self.target)
@@ -129,7 +130,7 @@ class Prediction:
                 return self.density.sample(Size((draws,))).std(0)
 
     def marginal(self, index: int) -> Distribution:
-        """Return the density of the number `index` of the target."""
+        """Return the marginal density of one number of the target, whose position in the target is `index`."""
         return self._marginals.setdefault(index, marginal(self.density, index))
 
     @cached_property
@@ -174,7 +175,7 @@ def table_columns(target: Target, prediction: Prediction) -> dict[str, Tensor]:
     """Return the columns of a table of predictions, (batch,) each, in the user's names and units; angles in degrees.
 
     For images it returns no point prediction, because images are stored beside the table. Densities with an outlier
-    score (`unchanged.outlier_score`) have a column for it.
+    score (`framework.distributions.unchanged`) have a column for it.
     """
     if target.kind == "image":
         columns = {}

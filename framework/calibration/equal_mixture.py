@@ -8,10 +8,10 @@ from framework.distributions.density import Mixture
 
 
 def equal_mixture(components: Distribution, model: nn.Module, device: torch.device) -> Mixture:
-    """Return the mixture over models (1/S) Σ_s p_s over the last batch dimension of `components`.
+    """Return the mixture, with equal weights, of the S densities p_s along the last batch dimension of `components`.
 
-    The weights have the dtype of the model's parameters, or float32 for parameters in half precision, in which S
-    weights would not sum to 1.
+    Its density is (1/S) Σ_s p_s. Its weights have the dtype of the model's parameters; for parameters in half
+    precision, they are float32, because S weights in half precision would not sum to 1.
     """
     dtypes = (parameter.dtype for parameter in model.parameters())
     dtype = next(dtypes, torch.get_default_dtype())  # trees have no parameters

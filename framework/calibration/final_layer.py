@@ -33,13 +33,13 @@ def find_final_layer(model: Predictor) -> nn.Linear | None:
 
 
 def run_final_layer(model: Predictor, layer: nn.Linear, inputs: Tensor, by: str) -> FinalLayerPass:
-    """Return what the final layer reads and returns for inputs.
+    """Return the input and the output of a model's final layer for a batch of inputs.
 
     Args:
         model: the predictor.
         layer: its final layer, as `find_final_layer` returns it.
-        inputs: inputs of the model.
-        by: name of the uncertainty wrapper that asks, for the message.
+        inputs: batch of inputs of the model.
+        by: name of the uncertainty wrapper that calls this function, for the error message.
 
     Raises:
         ConfigError: a predictor that is no `Model` calls the layer several times, or not with vectors.

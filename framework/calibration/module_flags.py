@@ -16,7 +16,7 @@ BATCH_NORM = (
 def evaluation_mode(model: nn.Module) -> Iterator[None]:
     """Set a model to evaluation mode inside the `with` block.
 
-    After the block, also after an error, the model has its own mode again.
+    After the block, also after an error, the model has the mode again that it had before.
     """
     training = model.training
     try:
@@ -32,7 +32,7 @@ def set_flag(
 ) -> Iterator[None]:
     """Set `flag`, for example "training", to `value` on all modules of the classes `kinds` inside the `with` block.
 
-    After the block, also after an error, each module has its own value again.
+    After the block, also after an error, the flag of each module has the value again that it had before.
     """
     before = [(module, getattr(module, flag)) for module in model.modules() if isinstance(module, kinds)]
     try:

@@ -18,15 +18,7 @@ from framework.uncertainty import held_out
 
 
 def nonempty_batches(batches: Iterable[Batch], by: str) -> list[Batch]:
-    """Return batches that can be read repeatedly, both by the wrapped predictor and by the wrapper.
-
-    Args:
-        batches: batches that may be iterated only once.
-        by: name of the wrapper, for the message.
-
-    Raises:
-        UserError: there is no sample in any batch.
-    """
+    """Return the batches that have samples as a list, which the wrapped predictor and the wrapper can read in turn."""
     nonempty = [batch for batch in batches if len(batch["target"])]
     if not nonempty:
         raise UserError(
@@ -52,7 +44,7 @@ def predict_densities(model: Predictor, batches: Sequence[Batch]) -> list[Distri
 
 
 def require_numbers(values: Float[Tensor, "sample"], batches: Sequence[Batch], quantity: str) -> None:
-    """Raise an error if a value is NaN, because a mean over values with NaN has no meaning.
+    """Raise an error if one of `values` is NaN, because the mean of the values would then be NaN.
 
     Args:
         values: one number per sample of all batches, in order.

@@ -10,11 +10,15 @@ SEED = 40
 
 
 def weight_noise(draw: int, size: int) -> Float[Tensor, "size"]:
-    """Return the standard normal numbers of one draw of `size` weights, float64, on the CPU.
+    """Return the standard normal numbers from which a wrapper draws `size` weights, float64, on the CPU.
 
-    The numbers are always the same, so that a model gives the same prediction in every mode and batch. A draw with an
-    odd number is the negative of the draw before it: the mean over an even number of draws is then exact (antithetic
-    variates; Hammersley & Morton 1956).
+    The numbers depend on `draw` and `size` only, so that a model gives the same prediction in every mode and batch. A
+    draw with an odd number is the negative of the draw before it, so the mean of the first 2 k draws is exactly 0 for
+    every k (antithetic variates; Hammersley & Morton 1956).
+
+    Args:
+        draw: Number of the draw, from 0.
+        size: Number of weights.
     """
     # NumPy, because an export would replace random numbers of torch; these are the same in all versions
     generator = np.random.RandomState([SEED, draw // 2])

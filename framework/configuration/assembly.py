@@ -30,7 +30,7 @@ The value of a group from which several plugins may be chosen is a list of confi
 
 @dataclass
 class Assembly:
-    """Plugins of a training, checked and built before any data is read; the session uses the same objects.
+    """Plugins of a training, checked and built before any data is read; `framework.runs.session` uses these objects.
 
     Attributes:
         parts: Resolved configs of all plugins.
@@ -158,8 +158,8 @@ def build_predictor(
 ) -> Predictor:
     """Return the untrained predictor, whose initial weights are a function of `seed` and the config.
 
-    The chain of encoders may begin with fixed ones (`Encoder.fixed`). All models share these, and they are placed
-    outside the uncertainty wrappers.
+    The chain of encoders may begin with fixed ones (`Encoder.fixed`), which are placed outside the uncertainty
+    wrappers. If a wrapper has several models, all of them share the fixed encoders.
 
     Args:
         resolved: Resolved configs of all plugins.
@@ -167,7 +167,8 @@ def build_predictor(
         input_shape: Shape of one input.
         seed: Seed of the initial weights.
         columns: Names of the input columns.
-        head: Density head for `target` that is built already (`Assembly.take_head`), for the first model.
+        head: Density head for `target` that is built already (`Assembly.take_head`); the first model gets it. None:
+            every model gets a new head.
     """
     # the model is built on the CPU; the generators of other devices stay unchanged
     torch.default_generator.manual_seed(seed)

@@ -231,7 +231,7 @@ def read_interface(
 
 
 def rebuild(description: Description, state: Mapping[str, torch.Tensor]) -> Predictor:
-    """Build the predictor of a description, fill in its weights, and return it in evaluation mode.
+    """Build the predictor that `description` describes, copy the weights `state` into it, and set evaluation mode.
 
     Raises:
         CheckpointError: The weights belong to another model.

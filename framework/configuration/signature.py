@@ -25,7 +25,7 @@ class Part(typing.NamedTuple):
 
 @cache
 def parts(cls: type) -> dict[str, Part]:
-    """Return the keyword-only parameters of `cls` that are annotated with an abstract base.
+    """Return, by name, the parameters of `cls` that take plugins: keyword-only ones annotated with an abstract base.
 
     Raises:
         ConfigError: An annotation contains a base in a form for which no config can name plugins, such as a dict.

@@ -112,7 +112,8 @@ class Exporting:
             count: number of arrays.
             spread: factor on the usual standard deviation of the arrays; above 1, images are black or white.
             seed: seed of the random numbers.
-            padded: whether every second array ends with rows of NaN; None: as `cloud` says.
+            padded: whether every second array ends with rows of NaN; None: only if the inputs are point clouds
+                (`cloud`).
         """
         generator = torch.Generator().manual_seed(seed)
         shape = (count, *self.description.input_shape)
@@ -130,10 +131,10 @@ class Exporting:
 
     @torch.no_grad()
     def accepted_arrays(self, count: int, spread: float) -> Tensor:
-        """Return `count` random arrays that the model accepts; `spread` is as in `arrays`.
+        """Return `count` random arrays that the model accepts; `spread` is a factor on their usual standard deviation.
 
-        An encoder may refuse random point clouds, because they are not in the unit ball. Every point is then moved to
-        one of the eight corners of a cube in this ball, so that most points are equal.
+        An encoder may refuse random point clouds, because some of their points are not in the unit ball. Every point is
+        then moved to one of the eight corners of a cube in this ball, so that many points coincide.
         """
         arrays = self.arrays(count, spread, seed=count)
         if self.cloud:
@@ -155,11 +156,12 @@ class Exporting:
 
     @torch.no_grad()
     def form(self, arrays: Tensor, noise: Sequence[Tensor | None] | None = None) -> Exported:
-        """Return the original model's densities as tensors (`exported`).
+        """Return the original model's densities as tensors (`framework.distributions.exported`).
 
         Args:
             arrays: the user's arrays, (batch, *input_shape).
-            noise: arrays that replace the random numbers of the model, as for `given_draws`.
+            noise: arrays that replace the random numbers of the model, in the order in which it draws them; None in
+                place of an array, or of all, stands for random numbers.
         """
         with given_draws(noise):
             return exported(self.density(arrays))
@@ -280,7 +282,7 @@ class ModelNoise:
 
     Attributes:
         name: name of the exported model's input for these numbers; "" if the density does not depend on them.
-        kind: as in `Noise`.
+        kind: "uniform" in [0, 1), or "normal" with mean 0 and variance 1.
         shape: length of each dimension; a text such as "50 * batch" stands for a multiple of the number of inputs.
         dtype: data type.
     """

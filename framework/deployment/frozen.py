@@ -70,8 +70,9 @@ class Frozen:
     """Deployable form of a predictor: a function from inputs to predictions.
 
     Its predictions have the data type of the predictor's parameters. The probabilities of fully connected classifiers
-    differ by at most 1e-6 from those of the predictor. Raw parameters that ONNX Runtime computes differ by at most 1e-5
-    times the largest one, or by 1e-5 if it is below 1; a network that differs more is run by torch.
+    differ by at most 1e-6 from those of the predictor. The raw parameters that ONNX Runtime computes differ from those
+    of torch by at most 1e-5 · max(1, largest raw parameter); a network whose raw parameters differ more is run by
+    torch.
 
     Args:
         predictor: the trained predictor; a copy of it is used.

@@ -81,11 +81,11 @@ def apply_budget(
         predictor: The model, as `load_with_description` returns it.
         description: Its description.
         budget: The limit.
-        paths: Paths that the user repeats, as in `load`.
+        paths: Files and folders that the user repeats, by their keys in the model's config, as in `load`.
         data: Prepared data whose validation split is used; None prepares the data of the model.
         settings: Settings whose `samples` and `seed` are used; None: those of the model's run.
-        batch_size: As in `meet_budget`.
-        work: As in `meet_budget`.
+        batch_size: Number of samples in the timed batch, if `budget.batch_size` is None.
+        work: Function that computes what the user needs from a prediction; its run time counts.
 
     Raises:
         ConfigError: As in `load`.

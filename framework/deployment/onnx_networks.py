@@ -27,7 +27,7 @@ class OnnxNetwork(nn.Module):
 
     Args:
         network: the network, which returns raw parameters, (batch, *raw).
-        probe: inputs for which it is traced, at least two.
+        probe: inputs with which the network is traced, at least two samples.
 
     Raises:
         ArithmeticError: the results of ONNX Runtime differ from those of torch.

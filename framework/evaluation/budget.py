@@ -69,7 +69,10 @@ class Knobs:
         return tuple(getattr(parts[0], name) for name, parts in zip(self.names, self.owners, strict=True))
 
     def settings(self) -> list[Setting]:
-        """Return all combinations of the values that the parts declare, and of their present values."""
+        """Return all combinations of values of the knobs.
+
+        The values of a knob are those that its part of the predictor declares, and its present value.
+        """
         present = self.current
         return list(
             product(
@@ -81,7 +84,7 @@ class Knobs:
         )
 
     def set(self, setting: Setting) -> None:
-        """Give the knobs these values."""
+        """Set each knob to its value in `setting`."""
         for name, parts, value in zip(self.names, self.owners, setting, strict=True):
             for part in parts:
                 setattr(part, name, value)
@@ -93,7 +96,7 @@ class Knobs:
 
 @dataclass(frozen=True)
 class Measure:
-    """Number of a metric that says how large the error of a setting is.
+    """The one number of a metric that serves as the error of a setting.
 
     Attributes:
         metric: metric that computes the number.
@@ -168,23 +171,24 @@ def meet_budget(
     """Set the knobs of a trained predictor to the cheapest setting that meets a budget, and say why in a sentence.
 
     With a limit of the run time, the settings within the limit are compared. A setting counts as equal to the one with
-    the lowest error if their difference is within its standard error (`Bench.equals`). Of these equal settings, the
-    fastest is chosen. With a limit of the error, the fastest setting whose error on the validation samples is within
-    the limit is chosen.
+    the lowest error if the difference of their errors is at most the standard error of this difference
+    (`Bench.equals`). Of these equal settings, the fastest is chosen. With a limit of the error, the fastest setting
+    whose error on the validation samples is within the limit is chosen.
 
     Args:
         predictor: the predictor, in evaluation mode; its knobs are set.
         data: prepared data, whose validation split is used.
         metrics: metrics from which `budget.metric` is chosen.
         budget: the limit.
-        samples: as in `Prediction`.
+        samples: number of samples for a point prediction that has no closed form.
         seed: seed of all random numbers.
-        batch_size: number of samples in the timed batch, if the budget says none.
-        work: what is computed from a prediction, beside the measure; its time counts.
+        batch_size: number of samples in the timed batch, if `budget.batch_size` is None.
+        work: function that computes what the user needs from a prediction. Its run time is part of the measured run
+            time, as is that of the metric.
 
     Raises:
-        ConfigError: the predictor has no knob, no metric has the measure, or no setting meets the budget; the message
-            names the nearest one.
+        ConfigError: the predictor has no knob, no metric computes `budget.metric`, or no setting meets the budget; the
+            message names the nearest setting.
     """
     knobs, measure = Knobs.of(predictor), Measure.of(metrics, budget.metric)
     bench = Bench(predictor, data.splits().validation, knobs, measure, samples, seed, work)
@@ -220,12 +224,12 @@ class Bench:
         validation: validation split.
         knobs: knobs of the predictor.
         measure: measure of the error.
-        samples: as in `Prediction`.
+        samples: number of samples for a point prediction that has no closed form.
         seed: seed of all random numbers.
-        work: as in `meet_budget`.
+        work: function that computes what the user needs from a prediction; its run time counts.
 
     Attributes:
-        milliseconds: run time per sample of each setting.
+        milliseconds: run time per sample of each setting, ms.
         count: number of validation samples with which errors are measured.
         timed: batch with which run times are measured.
     """
@@ -308,16 +312,21 @@ class Bench:
         )
 
     def worse(self, setting: Setting, other: Setting) -> Difference:
-        """Return by how much the error of a setting exceeds that of another: mean of paired differences of batches."""
+        """Return by how much the error of `setting` exceeds that of `other`.
+
+        The result is the mean of the paired differences: one difference for each batch of validation samples in which
+        both errors are finite.
+        """
         pairs = zip(self.errors(setting).batches, self.errors(other).batches, strict=True)
         finite = [pair for pair in pairs if all(map(math.isfinite, pair))]
         return paired_difference(*([self.measure.sign * pair[side] for pair in finite] for side in (0, 1)))
 
     def equals(self, setting: Setting, best: Setting) -> bool:
-        """Return whether the error of a setting is at most one standard error of the paired difference above the best.
+        """Return whether the error of `setting` exceeds that of `best` by at most one standard error.
 
-        This is the one-standard-error rule of Breiman et al. (1984), "Classification and regression trees", section
-        3.4.3, with the standard error of the difference.
+        The standard error is that of the paired difference of the two errors (`worse`). The rule is the
+        one-standard-error rule of Breiman et al. (1984), "Classification and regression trees", section 3.4.3, which
+        uses the standard error of the best setting instead.
         """
         difference = self.worse(setting, best)
         return setting == best or difference.value <= difference.standard_error
@@ -333,7 +342,7 @@ class Bench:
         )
 
     def score(self, setting: Setting) -> float:
-        """Return the error of a setting such that lower is better, and infinity for NaN."""
+        """Return the error of a setting with the sign that makes lower values better; infinity if the error is NaN."""
         value = self.measure.sign * self.errors(setting).value
         return math.inf if math.isnan(value) else value
 

@@ -91,7 +91,7 @@ class Painter:
         return all(value == self.renderer.background for value in self.ground)
 
     def paint(self, frames: Sequence[Frame]) -> list[dict[str, Tensor]]:
-        """Return the channels of each frame; "color" is linear RGB with three channels.
+        """Draw frames, and return the channels of each by name; "color" is linear RGB with three channels.
 
         Raises:
             DataError: the renderer cannot draw a scene; the message names the first frame.
@@ -152,7 +152,7 @@ def evaluate_frames(
         painter: renderer and background; its channels include those that the metrics read.
         blocks: groups of frames; the frames of a group are drawn together.
         metrics: metrics to compute; they are copied.
-        groups: names of the groups.
+        groups: names of the groups of frames; the field "group" of a frame's `truth` holds indices of these names.
         keep: function that is called with each frame and its channels, for example to write them to a file.
     """
     several = len(groups) > 1
@@ -175,7 +175,7 @@ def _fresh(metrics: "Sequence[Metric]") -> "list[Any]":
 
 
 def frame_cost(painter: Painter, frames: Sequence[Frame]) -> Cost:
-    """Return the cost of drawing `frames` together, and of drawing one frame.
+    """Return the cost per frame of drawing `frames` together, and the run time of drawing one frame alone.
 
     A renderer may reuse results that have not changed since the last image. Therefore no two consecutive images are the
     same: the frames are drawn in turn. A single frame alternates with one whose image is shifted by a pixel.

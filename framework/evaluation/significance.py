@@ -46,9 +46,9 @@ def mean(numbers: Mapping[str, object], key: str, runs: object) -> Mean:
     of these keys is exact.
 
     Args:
-        numbers: a result, as for `framework.reports.table`. "repeats", if given, is the number of repeats over which
-            its errors were computed; otherwise "test_samples" is the number of test samples over which a "<key>_sem"
-            was computed.
+        numbers: numbers of a result by key, as in results.json. "repeats", if given, is the number of repeats over
+            which a "<key>_sem" was computed; otherwise "test_samples" is the number of test samples over which it was
+            computed.
         key: key of the mean.
         runs: number of runs over which the mean was computed; anything but a whole number means that it is not known.
     """

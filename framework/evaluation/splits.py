@@ -67,8 +67,8 @@ def evaluate(
         predictor: the trained predictor; it is moved to `device`.
         batches: batches of BLOCK samples, so that the numbers do not depend on the batch size of training.
         metrics: metrics to compute; they are copied.
-        groups: names of the groups.
-        samples: as in `Prediction`.
+        groups: names of the groups of samples; the field "group" of a batch holds indices of these names.
+        samples: number of samples for a point prediction that has no closed form.
         seed: seed of the random numbers.
         device: device to predict on.
         outliers: batches of outliers; the metrics that read outliers get all of them, in total and in every group.
@@ -108,10 +108,10 @@ def predict(
     Args:
         predictor: the trained predictor.
         batch: the batch, on the predictor's device.
-        samples: as in `Prediction`.
+        samples: number of samples for a point prediction that has no closed form.
         draw: source of the random numbers.
-        split: source of the batch.
-        reads: as in `Prediction`.
+        split: "test" for a batch of the test split, "outliers" for a batch of outliers.
+        reads: channels of images that will be requested, so that they are drawn together.
     """
     with draw(split):
         density = predictor(batch["input"])
@@ -136,7 +136,7 @@ def _update(
 
 
 def numbers(metrics: "Sequence[Metric]") -> dict[str, float]:
-    """Return the values of all metrics, by name.
+    """Return the numbers that all metrics compute, by name.
 
     Raises:
         ConfigError: a value is not a single number, or two metrics use the same name.
@@ -196,7 +196,7 @@ def cost(predictor: Predictor, batch: Batch, *, samples: int, device: torch.devi
     Args:
         predictor: the trained predictor; it is moved to `device`.
         batch: the batch.
-        samples: as in `Prediction`.
+        samples: number of samples for a point prediction that has no closed form.
         device: device to predict on.
     """
     predictor.eval().to(device)

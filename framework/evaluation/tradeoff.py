@@ -33,8 +33,8 @@ class Point:
 
     Attributes:
         value: value of the knob.
-        numbers: for each metric, its mean over the repeats, "<key>", and their standard deviation, "<key>_std"; also
-            the numbers that `framework.evaluation.reference.errors` returns.
+        numbers: for each metric, its mean over the repeats, "<key>", and their standard deviation, "<key>_std"; with a
+            reference, also the numbers that `framework.evaluation.reference.errors` returns.
         milliseconds: median wall time per sample, from input to log-likelihood.
     """
 
@@ -69,7 +69,7 @@ class Curve:
 
 
 def knob_owners(predictor: Predictor, knob: str) -> list[Uncertainty | DensityHead]:
-    """Return the wrappers with the knob or, if no wrapper has it, the heads with the knob; [] for `knob=""`.
+    """Return the wrappers with the knob or, if there is no such wrapper, the heads with the knob; [] for `knob=""`.
 
     Raises:
         ConfigError: no wrapper or head has the knob; the message lists the existing knobs.
@@ -134,11 +134,11 @@ def tradeoff(
         values: values of the knob to try.
         reference: value of the knob for the reference, at least the largest of `values` and so large that its own error
             is negligible; None: no comparison with a reference.
-        samples: as in `Prediction`.
+        samples: number of samples for a point prediction that has no closed form.
         repeats: number of seeds for each value and for the reference; a reference needs at least two.
         seed: seed of all random numbers.
-        timed_calls: number of timed calls, as in `run_times`.
-        budget_seconds: limit of the timing, as in `run_times`.
+        timed_calls: largest number of timed calls for each value.
+        budget_seconds: limit on the duration of all timed calls, of which at least three are made for each value.
 
     Raises:
         ConfigError: there is no batch, no value or no such knob; the reference is below the largest value; or there are

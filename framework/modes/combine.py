@@ -24,7 +24,13 @@ from framework.uncertainty import Joining, SelfTraining, SeveralModels
 
 
 class CombineOptions(Options):
-    """Options of mode=combine: the models that become members, and the wrapper that joins them."""
+    """Options of mode=combine.
+
+    Attributes:
+        members: Folder of a sweep whose runs become the members, or a list with the run folder, checkpoint file or
+            MLflow run id of each member.
+        wrapper: Name of the uncertainty wrapper that joins the members, such as "ensemble".
+    """
 
     members: str | list[str]
     wrapper: str
@@ -109,7 +115,7 @@ def wrapper_config(wrapper: str, count: int) -> dict[str, Any]:
 
 
 def outer_wrappers(wrappers: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the resolved configs of the wrappers that `uncertainty` puts around the joined model, innermost first.
+    """Return the resolved configs of `wrappers`, which are put around the joined model, innermost first.
 
     Raises:
         ConfigError: One of them needs several models, but there is only one joined model.
@@ -126,7 +132,16 @@ def outer_wrappers(wrappers: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def build_joined(config: dict[str, Any], data: Data, members: Sequence[Predictor]) -> Predictor:
-    """Build the predictor of `config`, which contains the wrapper of `wrapper_config`, and join the members in it."""
+    """Return the predictor that `config` describes, with `members` as the members of its wrapper.
+
+    Args:
+        config: Resolved configs of all plugins, with the wrapper that joins the members (`wrapper_config`).
+        data: Data set whose target and inputs the predictor has.
+        members: Trained predictors, whose weights are copied.
+
+    Raises:
+        CheckpointError: The fixed encoders of two members differ.
+    """
     predictor = build_predictor(config, data.target, data.input_shape, 0, data.columns)
     if isinstance(predictor, FrozenFrontEnd):
         members = [_inner_predictor(predictor, member, index) for index, member in enumerate(members)]

@@ -19,7 +19,7 @@ class ExportOptions(Options):
 
 
 def run(config: Config) -> None:
-    """Write the exported folder, and print how far it differs from the model and how long a prediction takes."""
+    """Write the exported model, and print its largest difference from the original and the time of its predictions."""
     options = config.options(ExportOptions)
     console = set_up_process(config.settings)
     require_packages()

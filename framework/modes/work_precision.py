@@ -26,7 +26,17 @@ ERROR, AXIS = "error_nats", "error of the mean log-likelihood (nats, RMS)"
 
 
 class WorkPrecisionOptions(Options):
-    """Options of mode=work_precision: the knob, its values, and the quantities to measure."""
+    """Options of mode=work_precision.
+
+    Attributes:
+        knob: Name of the knob; None for the model's first knob.
+        values: Values of the knob; None for those that the plugin declares.
+        repeats: Number of seeds for each value of the knob.
+        reference: Value of the knob at which the reference log-likelihoods are computed.
+        limit: Number of test samples.
+        metrics: Names of the numbers to measure, such as "nll" or "error_nats", the error of the log-likelihood. None:
+            "error_nats" for a knob of a density head, all numbers of the metrics for a knob of a wrapper.
+    """
 
     knob: str | None = None
     values: list[Positive] | None = None

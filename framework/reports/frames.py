@@ -49,7 +49,7 @@ class Shown:
     frames: list[Rendered] = field(default_factory=list)
 
     def keep(self, index: int, frame: Frame, channels: Mapping[str, Tensor]) -> None:
-        """Keep a frame if the figure shows it; `index` counts the frames of the run."""
+        """Keep a frame if the figure shows it; `index` is the number of the frame in the run, from 0."""
         step = max(1, math.ceil(self.count / MOST_SHOWN))
         if index % step or "color" not in channels:
             return

@@ -141,7 +141,7 @@ def results_of(
         evaluation: values of the metrics.
         run_cost: cost of a prediction.
         columns: headings of the table, by key.
-        better: directions of the columns.
+        better: for each key, whether a "higher" or a "lower" number is better.
     """
     return {
         "method": method,

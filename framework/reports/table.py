@@ -61,8 +61,9 @@ def results_table(
         columns: headings by key, in order; the first column names the result.
         title: title above the table. If all results are synthetic, "(synthetic data)" is added to it; if only some are,
             a further column says which.
-        better: directions of the columns in which the best number may be bold; a single result is never bold. Headings
-            have arrows in these directions. None: the arrows are those of the first row's "better", if it has one.
+        better: "higher" or "lower" for the keys of columns in which the best number may be bold, whichever is better; a
+            single result is never bold. Headings have arrows in these directions. None: the arrows are those of the
+            first row's "better", if it has one.
     """
     synthetic = [_synthetic(row) for row in rows]
     if rows and all(synthetic) and "synthetic" not in title.lower():
@@ -93,9 +94,10 @@ def markdown(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better 
     """Return a table of the results in Markdown; if any result is synthetic, a column says which ones are.
 
     Args:
-        rows: as for `results_table`.
-        columns: as for `results_table`.
-        better: directions of the columns in which the best number may be bold; None: no number is bold.
+        rows: the results, one per row.
+        columns: headings by key, in order; the first column names the result.
+        better: "higher" or "lower" for the keys of columns in which the best number may be bold, whichever is better;
+            None: no number is bold.
     """
     lines = _lines(rows, columns, better or {}, origin=any(map(_synthetic, rows)))
     cells = [[_escape(cell) for cell in line] for line in lines]
@@ -111,9 +113,10 @@ def html(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | No
     If any result is synthetic, a column says which ones are.
 
     Args:
-        rows: as for `results_table`.
-        columns: as for `results_table`.
-        better: as for `results_table`; None: no number is bold, and no heading has an arrow.
+        rows: the results, one per row.
+        columns: headings by key, in order; the first column names the result.
+        better: "higher" or "lower" for the keys of columns in which the best number may be bold, whichever is better;
+            None: no number is bold, and no heading has an arrow.
     """
     lines = _lines(rows, columns, better or {}, origin=any(map(_synthetic, rows)))
     _add_arrows(lines[0], columns, better)
@@ -137,9 +140,10 @@ def latex(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | N
     If any result is synthetic, a column says which ones are.
 
     Args:
-        rows: as for `results_table`.
-        columns: as for `results_table`.
-        better: directions of the columns in which the best number may be bold; None: no number is bold.
+        rows: the results, one per row.
+        columns: headings by key, in order; the first column names the result.
+        better: "higher" or "lower" for the keys of columns in which the best number may be bold, whichever is better;
+            None: no number is bold.
     """
     lines = _lines(rows, columns, better or {}, origin=any(map(_synthetic, rows)))
     head, *body = (" & ".join(_latex_cell(cell) for cell in line) + r" \\" for line in lines)

@@ -78,7 +78,7 @@ def error_against_run_time(
     rings, but a text that says so. On a logarithmic axis an error of 0 is drawn on the lower edge and labelled.
 
     Args:
-        rows: as for `framework.reports.table`, each with its "method".
+        rows: the results, one per row, with the numbers of each by key and its "method".
         labels: label of the axis, by key.
         better: for each key, the direction in which it is better; a key with "lower" is an error.
         title: title of the figure.

@@ -65,7 +65,11 @@ class Fitted(NamedTuple):
 
 
 def fit(session: Session, run: Run) -> Fitted:
-    """Fit the predictor. Ranks other than the first return after training without loading the fitted weights."""
+    """Fit the session's predictor, and return the validation loss and the epoch of the fitted weights.
+
+    Only the first rank loads the fitted weights into the predictor; the other ranks return after training without
+    loading them.
+    """
     if session.settings.checkpoint is None:  # weights of another training belong to its own fitted encoders
         _fit_encoders(session)
     wrapper = self_training(session.predictor)

@@ -698,7 +698,7 @@ class _TrainingSplit:
 def trained_batches(batches: Batches) -> Iterator[Batch]:
     """Yield the batches of the training and the validation split, on which a wrapper trains its models itself.
 
-    Each batch also has the field "row", the number of each sample in this order.
+    Each batch also has the field "row": the number, from 0, of each of its samples among the samples of both splits.
     """
     first = 0
     splits = batches.data.splits()

@@ -37,11 +37,11 @@ class Part:
     """Triangles of one material.
 
     Attributes:
-        vertices: in metres, or in the file's unit.
+        vertices: positions, in metres or in the file's unit.
         faces: indices of `vertices`, counter-clockwise when seen from outside.
         colors: linear RGB in [0, 1], multiplied by the texture's colours; None if the file gives no colours.
-        image: the texture, linear RGB in [0, 1], rows from top to bottom.
-        uv: texture coordinates, u to the right, v upwards.
+        image: the texture, linear RGB in [0, 1], rows from top to bottom; None without a texture.
+        uv: texture coordinates, u to the right, v upwards; None if the file gives none.
         corners: indices of `uv` for each face; None if they equal `faces`.
         wraps: rules for texture coordinates beyond the image's edges, along u and along v.
         smooth: whether to interpolate between texels.

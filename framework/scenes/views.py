@@ -125,7 +125,7 @@ class FileFrames:
         return self._loaded[number]
 
     def batch(self, index: int) -> Batch:
-        """Return a frame as a batch of one: "index", "group" and, if there are true images, "color" and "mask".
+        """Return a frame as a batch of one sample: "index", "group" and, if there are true images, "color" and "mask".
 
         Raises:
             DataError: the true image is missing or damaged, or has another size than the camera's image.
@@ -168,7 +168,15 @@ def find_scene_files(path: Path) -> list[Path]:
 def read_true_image(
     file: Path, ground: tuple[float, float, float]
 ) -> tuple[Float[Tensor, "height width 3"], Tensor | None]:
-    """Return an image in linear RGB on `ground`, and the mask of its opaque half, or None without transparency.
+    """Read an image that may be transparent, and return its colours and its mask.
+
+    Args:
+        file: path of the image.
+        ground: linear RGB that shows through transparent pixels.
+
+    Returns:
+        The image in linear RGB in front of `ground`; and a mask that is True where the opacity is at least a half, None
+        if the image has no transparency.
 
     Raises:
         DataError: the file cannot be read as an image.

@@ -74,14 +74,12 @@ def evaluate_lines(parameters, measured, offsets, centres, jacobian, residuals):
 def compute_sums(parameters, rows, measured, offsets, centres, cost, gradient, gram, measured_counts):
     """Fill arrays with sums over the offsets of each spectrum, for the residuals r and their Jacobian J.
 
-    The module's description lists the first five arguments.
-
     Args:
-        parameters: parameters of the spectra.
-        rows: row of each spectrum in `measured`.
-        measured: measured Z.
-        offsets: offsets.
-        centres: centres of the pools.
+        parameters: parameters of the spectra, (spectrum, p).
+        rows: row of each spectrum in `measured`, (spectrum,).
+        measured: measured Z, (row, offset), NaN where nothing was measured.
+        offsets: offsets, (offset,), ppm.
+        centres: centres of the pools, (pool,), ppm from water.
         cost: filled with half the sum of squared residuals, (spectrum,).
         gradient: filled with Jᵀr, (spectrum, p).
         gram: filled with JᵀJ, (spectrum, p, p).
@@ -112,9 +110,17 @@ def compute_sums(parameters, rows, measured, offsets, centres, cost, gradient, g
 @compiled
 @no_type_check
 def compute_curvature(parameters, rows, measured, offsets, centres, curvature):
-    """Fill `curvature` (spectrum, p, p) with the sum over the offsets of the residual times ∇²Z.
+    """Fill `curvature` with the sum over the offsets of the residual times ∇²Z.
 
-    ∇²Z is the matrix of second derivatives of Z by the parameters. The module's description lists the arguments.
+    ∇²Z is the matrix of second derivatives of Z by the parameters.
+
+    Args:
+        parameters: parameters of the spectra, (spectrum, p).
+        rows: row of each spectrum in `measured`, (spectrum,).
+        measured: measured Z, (row, offset), NaN where nothing was measured.
+        offsets: offsets, (offset,), ppm.
+        centres: centres of the pools, (pool,), ppm from water.
+        curvature: filled with the sums, (spectrum, p, p).
     """
     pools, size, count = centres.shape[0], parameters.shape[1], offsets.shape[0]
     shift = 2 * pools

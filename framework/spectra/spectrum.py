@@ -1,8 +1,8 @@
 """Z-spectra as one minus a sum of Lorentzian lines, one for each pool of protons, with first and second derivatives.
 
-Z(Δω) = 1 - Σ_i A_i (w_i/2)² / ((w_i/2)² + (Δω - δ_i)²), offsets Δω, widths w (at half maximum) and centres δ in ppm
-(Zaiss et al. 2011; Windschuh et al. 2015). The centre of water is the shift of the static field B0, and the centres of
-the other pools are counted from it.
+Z(Δω) = 1 - Σ_i A_i (w_i/2)² / ((w_i/2)² + (Δω - δ_i)²), with amplitudes A; offsets Δω, widths w (at half maximum) and
+centres δ are in ppm (Zaiss et al. 2011; Windschuh et al. 2015). The centre of water is the shift of the static field
+B0, and the centres of the other pools are counted from it.
 """
 
 from typing import Literal, NamedTuple

@@ -75,7 +75,7 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]], config: Mapping[
     Args:
         folder: Folder of the sweep.
         overrides: Overrides of each job of this command.
-        config: Composed config of the first job, as for `begin`; no store but the one that it names is contacted.
+        config: Composed config of the first job; no store but the one that it names is contacted.
     """
     console = output()
     jobs = find_job_folders(folder)
@@ -143,7 +143,7 @@ def close_parent(folder: Path, files: Sequence[Path], summary: str, config: Mapp
         folder: Folder of the sweep.
         files: Files to log.
         summary: Text for the description of the run; "" leaves the description unchanged.
-        config: As for `begin`.
+        config: Composed config of the first job.
     """
     begun = read_run_info(folder)  # written by `begin` of this command
     if (config.get("logger") or {}).get("name") != "mlflow" or begun is None:

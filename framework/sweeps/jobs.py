@@ -43,12 +43,12 @@ log = logging.getLogger(__name__)
 class Job:
     """One job of a sweep.
 
-    The record of a job, job.json, has number, overrides, key and config as below. The record also has command, pid,
-    tries, started and ended (seconds since 1970, of the last try), processor_seconds, error and status. The processor
-    time covers all tries, threads and processes of the job; it is null if the sweep was killed during one of the tries.
-    A job that runs on a node of a cluster (SLURM, Ray) also has a handle, the name by which the engine knows the job.
-    The status is "queued", "running", "completed", "failed" (the job exited with an error) or "died" (the job was
-    killed, or stopped by a signal).
+    The record of a job, job.json, has the number, the overrides, the key and the config that the attributes describe.
+    It also has command, pid, tries, started and ended (seconds since 1970, of the last try), processor_seconds, error
+    and status. The processor time covers all tries, threads and processes of the job; it is null if the sweep was
+    killed during one of the tries. A job that runs on a node of a cluster (SLURM, Ray) also has a handle, the name by
+    which the engine knows the job. The status is "queued", "running", "completed", "failed" (the job exited with an
+    error) or "died" (the job was killed, or stopped by a signal).
 
     Attributes:
         number: Number of the job in the sweep.
@@ -286,7 +286,7 @@ def run(
 def failure(jobs: Sequence[Job]) -> UserError | None:
     """Return an error that lists the jobs that did not complete; None if all completed.
 
-    Jobs with the same error are listed together, with the console of the first one.
+    Jobs with the same error are listed together, with the path of the first job's console output.
     """
     bad = [job for job in jobs if job.record.get("status") != "completed" and not job.is_elsewhere]
     if not bad:

@@ -31,7 +31,7 @@ class Comparison:
         by: Keys that distinguish the rows: "method", "data" and varied settings.
         varied: Settings whose values differ between the runs.
         columns: Headings of the table by key.
-        better: Directions of the columns.
+        better: For each key, whether a "higher" or a "lower" number is better.
     """
 
     runs: Sequence[Mapping[str, Any]]
@@ -71,7 +71,7 @@ def compare(runs: Sequence[Mapping[str, Any]], overrides: Sequence[Sequence[str]
 
 
 def headline(compared: Comparison) -> str | None:
-    """Return the key of the first number that all rows have, that is not a cost, and that has a better direction."""
+    """Return the key of the first number that all rows have, that is not a cost, and that is in `compared.better`."""
     keys = (key for key in compared.runs[0]["columns"] if key in compared.better and key not in COST_COLUMNS)
     return next((key for key in keys if all(key in row for row in compared.rows)), None)
 
@@ -88,7 +88,7 @@ def row_names(compared: Comparison) -> list[str]:
 
 
 def comparison_figure(compared: Comparison) -> "Figure | None":
-    """Return the figure of the headline number against run time; None if a run lacks one of them."""
+    """Return the figure of one number (`headline`) against run time; None without this number or a run time."""
     from framework.reports.tradeoff_picture import error_against_run_time
 
     runs, rows, data = compared.runs, compared.rows, compared.by[1]

@@ -52,7 +52,8 @@ class Ball(Mixture):
 
     Args:
         density: Density of batch_shape (batch,).
-        place, size: Location of the ball and size of the images, as in `ball`.
+        place: Location of each density, (batch, number), which determines where its ball is (`ball`).
+        size: Height and width of the images, pixels.
 
     Attributes:
         requested_channels: Channels of each call of `images`, in order.

@@ -31,7 +31,7 @@ JOINTS = np.array(
 
 
 def doll() -> dict[str, np.ndarray]:
-    """Return the arrays of a body with a small octahedron around every joint, which follows that joint alone."""
+    """Return the arrays of a body model with a small octahedron around every joint; it follows this joint alone."""
     around = 0.04 * np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)])
     faces = np.array([(0, 2, 4), (2, 1, 4), (1, 3, 4), (3, 0, 4), (2, 0, 5), (1, 2, 5), (3, 1, 5), (0, 3, 5)])
     template = np.concatenate([joint + around for joint in JOINTS])
@@ -49,13 +49,13 @@ def doll() -> dict[str, np.ndarray]:
 
 
 def write_body_file(folder: Path) -> Mapping[str, str]:
-    """Write the doll to a file in a folder, and return {name of the parameter of plugins: path of this file}."""
+    """Write the doll to a file in a folder, and return the parameters {"body": path of the file} of a plugin."""
     np.savez(folder / "doll.npz", **doll())  # type: ignore[arg-type]
     return {"body": str(folder / "doll.npz")}
 
 
 def small_body() -> Mapping[str, str]:
-    """Return what `write_body_file` returns, for a folder that lasts as long as this process."""
+    """Write the doll to a file, and return {"body": path of the file}; the file lasts as long as this process."""
     return write_body_file(Path(FOLDER.name))
 
 
@@ -68,9 +68,10 @@ def person(number: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_subjects(folder: Path) -> Mapping[str, str]:
-    """Write six subjects of 40 coloured vertices, and return {name of the parameter of plugins: path of their folder}.
+    """Write six subjects of 40 coloured vertices to a folder, and return {"root": path of the folder}.
 
-    Each subject has two photographs and masks of 12 × 9 random pixels, and a texture.
+    "root" is the parameter with which data sets of scans find their folder. Each subject has two photographs and masks
+    of 12 × 9 random pixels, and a texture.
     """
     folder.mkdir(exist_ok=True)
     names = {"train": ("ann", "bob", "cleo"), "validation": ("dan",), "test": ("eve", "fay")}

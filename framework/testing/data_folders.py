@@ -151,7 +151,8 @@ class Workbench:
     def location_keys(self) -> list[str]:
         """Names of the parameters that locate the data.
 
-        They are the parameters with a path that `write` returned or, without `write`, `root` if the data set has it.
+        They are the parameters for which the row's `write` returned a path in its folder. For a row without `write`,
+        the only one is `root`, if the data set has this parameter.
         """
         if self.row.write is None:
             return ["root"] if "root" in inspect.signature(type(self.data)).parameters else []

@@ -50,7 +50,7 @@ def spaced_indices(length: int, most: int) -> list[int]:
 
 
 def indices_to_check(split: Any) -> list[int]:
-    """Return the indices of all samples, or of as many as MOST, BYTES and SECONDS allow.
+    """Return the indices of all samples, or of as many as the limits on number (MOST), memory and time allow.
 
     A long split is divided into equally long blocks, and one sample of each block is drawn at random, so that periodic
     faults are found. The first and the last sample are included.

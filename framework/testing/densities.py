@@ -466,7 +466,7 @@ def mode_of_mixture(density: Distribution, worst: Worst) -> None:
 
 
 def marginals(density: Distribution, worst: Worst) -> None:
-    """Check that `marginal(density, i)` is the joint density integrated over the other angles."""
+    """Check that `marginal(density, i)` is the density of all angles, integrated over every angle but angle i."""
     numbers = density.event_shape[0]
     points = (
         4096 if numbers == 2 else 64

@@ -28,8 +28,9 @@ def gradient(subject: HeadSubject, worst: Worst) -> None:
     The derivatives are compared with central differences for each item of the batch, at random targets and at draws. Of
     three step lengths, the one with the smallest error counts, since a small step suffers from rounding and a large one
     may cross a kink. If all three disagree, three smaller steps follow, which resolve a narrow density. Then the
-    difference that is closest to the difference with the previous step counts, whatever its error is. A derivative that
-    agrees with the difference on one side is right too, since the loss may have a kink at the target.
+    central difference counts that is closest to the one with the previous step length, whatever its error is. A
+    derivative that agrees with the one-sided difference to the left or to the right is right too, since the loss may
+    have a kink at the target.
     """
     head = subject.make().double().train()
     for size in (0.1, 1.0, 3.0, 30.0, 1e3):
@@ -84,7 +85,7 @@ class Difference(NamedTuple):
     Attributes:
         slope: Estimate of the derivative.
         noise: Bound on the error of `slope` from rounding.
-        sides: Differences to the left and to the right, (2, ...).
+        sides: One-sided differences, to the left and to the right of the point, (2, ...).
     """
 
     slope: Tensor
@@ -96,15 +97,20 @@ class Difference(NamedTuple):
 
         Args:
             analytic: Derivative to compare with the slope.
-            least: The divisor is the slope's magnitude, but at least this number and at least 1e-3.
+            least: Smallest divisor: the error is divided by the largest of |slope|, this number and 1e-3.
         """
         scale = self.slope.abs().clamp(min=1e-3).maximum(torch.as_tensor(least))
         return ((analytic - self.slope).abs() - self.noise).clamp(min=0) / scale
 
     def error_at_kink(self, analytic: Tensor, least: Tensor | float) -> Tensor:
-        """Return the error as `error` does, relative to the difference on the side that is nearer to the derivative.
+        """Return the error of a derivative as `error` does, but from the nearer one of the two one-sided differences.
 
-        For a loss without a kink, both differences are close to the slope.
+        The error is relative to this one-sided difference. For a loss without a kink, both one-sided differences are
+        close to the slope.
+
+        Args:
+            analytic: Derivative to compare with the one-sided differences.
+            least: Smallest divisor, as in `error`.
         """
         scale = self.sides.abs().clamp(min=1e-3).maximum(torch.as_tensor(least))
         return (((analytic - self.sides).abs() - 2 * self.noise).clamp(min=0) / scale).amin(0)
@@ -119,7 +125,7 @@ def difference(
     Args:
         loss: Function that returns the loss of each item of the batch.
         argument: Tensor on which the loss depends; it is changed in place during the call, and restored.
-        direction: Direction in which it is changed.
+        direction: Direction in which `argument` is changed.
         step: Step length.
         whole: If true, return the difference of the sum of all losses, otherwise of each loss.
     """
@@ -137,9 +143,14 @@ def difference(
 
 
 def most_certain(differences: Sequence[Difference]) -> Difference:
-    """Return for each item of the batch the difference that is least uncertain.
+    """Return, for each item of the batch, the finite difference that is least uncertain.
 
-    The uncertainty of a difference is its distance from the difference with the previous step, plus its noise.
+    The uncertainty of a finite difference is the distance of its slope from the slope with the previous step length,
+    plus its bound on the rounding error.
+
+    Args:
+        differences: At least two finite differences of the same losses, each with another step length. The first one
+            only serves for comparison with the second.
     """
     slope = torch.stack([candidate.slope for candidate in differences])
     noise = torch.stack([candidate.noise for candidate in differences])

@@ -339,7 +339,7 @@ class Many:
         images: True if the predictions have images.
 
     Attributes:
-        predictions: Predictions.
+        predictions: The predictions.
         index: Indices of all predictions.
     """
 

@@ -91,7 +91,7 @@ def examine_objective(row: ObjectiveRow, build: Make) -> Iterator[Finding]:
 
     Args:
         row: Contract row of the objective.
-        build: Function that builds the objective, as `Make`.
+        build: Function that builds the objective with its weight multiplied by a given factor.
     """
     checks: dict[str, tuple[float, Callable[[Worst], None]]] = {
         "on the device of its inputs": (0.0, lambda worst: _on_one_device(build, row, worst)),

@@ -210,7 +210,7 @@ def check_quadratic_bound(density: Distribution, worst: Worst) -> None:
 
 
 def check_recentre(density: Distribution, worst: Worst) -> None:
-    """Check `recentre` for densities of one number: its log_prob at d must be the log_prob at the origin plus d."""
+    """Check `recentre` to o, for densities of one number: log_prob at d must be the original log_prob at o + d."""
     rows = density.batch_shape[0]
     index = torch.arange(2 * rows + 1) % rows
     width = known_widths(density)

@@ -91,7 +91,7 @@ def _nearest_faces(scene: Scene, down: float, across: float) -> tuple[Tensor, Te
 
 
 def camera(size: tuple[int, int]) -> Camera:
-    """Return a camera with pixels that are not square and an off-centre principal point, so that swapped axes show."""
+    """Return a camera with oblong pixels and an off-centre principal point, which reveal that two axes are swapped."""
     plain = look_from(-0.5, 0.3, 0.4, distance=4.0, field_of_view=0.8, size=size)
     (across, down), (column, row) = plain.focal, plain.principal
     return replace(

@@ -35,7 +35,7 @@ def cells_of_three_angles(density: Distribution, count: int) -> tuple[list[Tenso
     roughest.
 
     Args:
-        density: Density of three angles, with or without ranges.
+        density: Density of three angles, each over a whole turn or over a shorter range.
         count: Cells per angle.
     """
     assert isinstance(density.support, Circular)

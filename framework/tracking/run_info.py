@@ -81,7 +81,7 @@ class RunInfo:
 
     @classmethod
     def at(cls, place: Destination, folder: Path) -> "RunInfo":
-        """Return the record of a new run in `folder`.
+        """Return the record of a new run in `folder`, which is sent to `place`.
 
         Raises:
             ConfigError: MLflow cannot keep runs in the store `place.uri`.

@@ -47,7 +47,7 @@ class StoreProcess:
         return _DistantStore(self, folder, info)
 
     def start(self) -> None:
-        """Start the process if it does not run; it imports MLflow at once."""
+        """Start the process, which imports MLflow at once; do nothing if the process runs already."""
         if self._process is not None and self._process.poll() is not None:
             self.end()
         if self._process is None:
@@ -102,10 +102,11 @@ _early: list[StoreProcess] = []
 
 @contextmanager
 def started_early() -> Iterator[None]:
-    """Start the process for the tracker that is opened inside the block; end the process if no tracker takes it.
+    """Start the process that writes to MLflow's store, for a tracker that is opened inside the block.
 
-    The process imports MLflow while the command imports PyTorch and reads its data, which uses one core. So the import
-    takes no time from the training, and a short run need not wait for it at its end.
+    The process imports MLflow on a second core while the command, on one core, imports PyTorch and reads its data. So
+    the import takes no time from the training, and a short run need not wait for the import at its end. If no tracker
+    has taken the process (`take_process`) when the block ends, the process is ended.
     """
     process = StoreProcess()
     process.start()
@@ -119,7 +120,7 @@ def started_early() -> Iterator[None]:
 
 
 def take_process() -> StoreProcess:
-    """Return the process that `started_early` has started; without it, a process that starts at its first use."""
+    """Return the process of `started_early`; if there is none, return a new one, which starts at its first request."""
     return _early.pop() if _early else StoreProcess()
 
 

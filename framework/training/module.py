@@ -108,7 +108,10 @@ class Training(pl.LightningModule):
         self.cached = cached
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute; skip torch's slow checks for the hook name, which Lightning sets 50 times in each step."""
+        """Set an attribute, without torch's slow checks if it is the name of the hook that Lightning is running.
+
+        Lightning sets this name 50 times in each step.
+        """
         if name == "_current_fx_name":  # the checks of torch's modules would take 0.1 ms in each step
             self.__dict__[name] = value
         else:

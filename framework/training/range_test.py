@@ -62,7 +62,7 @@ class RangeTestResult:
         learning_rate: rate at which the loss falls fastest.
         slope: slope of the loss at this rate, nats per decade of the rate; negative.
         slope_error: standard error of the slope.
-        lowest: rate at which the mean of the losses in the window is lowest.
+        lowest: rate at which the loss, averaged over the neighbouring steps, is lowest.
     """
 
     rates: tuple[float, ...]
@@ -172,7 +172,7 @@ def measure_losses(
         optimizer: settings of the optimiser; its rate and its schedule are replaced.
         arguments: arguments of Lightning's Trainer for the training, of which those in KEPT are used.
         stopper: handler of signals.
-        cached: as in `Training`.
+        cached: True if `batches` hold cached features instead of inputs; `predictor` is then a `FrozenFrontEnd`.
 
     Raises:
         ConfigError: an objective trains an adversary, whose rate is not that of the predictor; or several processes
@@ -223,7 +223,7 @@ def suggest(rates: list[float], losses: list[float]) -> RangeTestResult:
     """Return the learning rate at which the loss falls fastest with the logarithm of the rate.
 
     The slope at a step is that of a line fitted by least squares to the losses of the 2 · HALF_WINDOW + 1 steps around
-    it. Only rates up to the one with the lowest mean loss in the window are considered, and only slopes that are
+    it. Only rates up to the one with the lowest mean loss of these steps are considered, and only slopes that are
     negative by at least CERTAIN standard errors.
 
     Args:
