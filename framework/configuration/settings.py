@@ -221,7 +221,7 @@ REFUSED_CALLBACKS = {
 
 
 class EarlyStoppingSettings(_Strict):
-    """When a training stops early, in addition to `trainer.patience`."""
+    """Conditions under which a training stops early, in addition to `trainer.patience`."""
 
     min_delta: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     """Smallest fall of the validation loss that counts, nats."""
@@ -239,7 +239,7 @@ class WeightAveragingSettings(_Strict):
 
 
 class GradientAccumulationSettings(_Strict):
-    """Numbers of batches whose gradients are added for a step."""
+    """Numbers of batches whose gradients are averaged for one optimiser step, by epoch."""
 
     batches: Annotated[dict[NotNegative, Count], Field(min_length=1)]
     """Number of batches of a step from an epoch on, by the epoch, from 0; before the first one a step has one batch."""
@@ -262,7 +262,7 @@ CALLBACKS: Mapping[str, type[BaseModel]] = {
 
 
 class CallbackSettings(_Strict):
-    """Chosen callbacks of a training, with their settings; None for a callback that is not chosen."""
+    """Chosen callbacks of Lightning for a training, with their settings; None for a callback that is not chosen."""
 
     early_stopping: EarlyStoppingSettings | None = None
     weight_averaging: WeightAveragingSettings | None = None

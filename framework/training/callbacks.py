@@ -33,7 +33,7 @@ def build_callbacks(chosen: CallbackSettings, keep: KeepCheckpoints, console: Co
 
     Args:
         chosen: callbacks and their settings.
-        keep: callback that writes checkpoints. What a checkpoint stores must precede it.
+        keep: callback that writes checkpoints. Callbacks that change what a checkpoint stores precede it.
         console: console on which a callback prints.
     """
     before: list[pl.Callback] = []
@@ -71,14 +71,14 @@ class AccumulateGradients(GradientAccumulationScheduler):
     """Callback that accumulates gradients over more or fewer batches from an epoch on.
 
     Args:
-        settings: numbers of batches, and the epochs from which they hold.
+        settings: number of batches of a step, from each listed epoch on.
     """
 
     def __init__(self, settings: GradientAccumulationSettings) -> None:
         super().__init__({0: 1, **settings.batches})
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Set the number of the present epoch, in the middle of which a resumed run may begin."""
+        """Set the number of batches of a step for the present epoch, in the middle of which a resumed run may begin."""
         super().on_train_start(trainer, pl_module)
         self.on_train_epoch_start(trainer)
 
@@ -112,11 +112,11 @@ class AverageWeights(WeightAveraging):
         return torch.lerp(average, current.to(average.dtype), weight)
 
     def should_update(self, step_idx: int | None = None, epoch_idx: int | None = None) -> bool:
-        """Return whether the average takes in the weights: after each step from the first epoch on."""
+        """Return whether the present weights enter the average, as after each step from the epoch `first_epoch` on."""
         return step_idx is not None and self._epoch >= self.first_epoch
 
     def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
-        """Copy the weights, but not the data set.
+        """Copy the model for the average, without the data set to which it refers.
 
         Raises:
             ConfigError: A wrapper collects weights itself, which the average would mix.
@@ -140,7 +140,7 @@ class AverageWeights(WeightAveraging):
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Take the weights into the average."""
+        """Add the present weights to the average."""
         self._epoch = trainer.current_epoch
         super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
 
@@ -150,7 +150,7 @@ class AverageWeights(WeightAveraging):
         super().on_validation_epoch_start(trainer, pl_module)
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Leave the average in the model until `return_weights`."""
+        """Do nothing, so that the average stays in the model until `return_weights` is called."""
 
     def return_weights(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Exchange the average for the trained weights after a validation."""
@@ -159,7 +159,7 @@ class AverageWeights(WeightAveraging):
     def on_save_checkpoint(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Store the average as the weights of the model, and the trained weights beside it."""
+        """Store in a checkpoint the average as the weights of the model, and the trained weights beside it."""
         self._begin(pl_module)
         super().on_save_checkpoint(trainer, pl_module, checkpoint)
 
@@ -170,13 +170,17 @@ class AverageWeights(WeightAveraging):
 
 
 class ReturnWeights(BatchCallback):
-    """Callback that lets `AverageWeights` return the trained weights at the very end of a validation."""
+    """Callback that puts the trained weights back into the model at the very end of a validation.
+
+    Args:
+        average: callback that has exchanged them for their average.
+    """
 
     def __init__(self, average: AverageWeights) -> None:
         self.average = average
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Return the trained weights."""
+        """Exchange the average in the model for the trained weights."""
         self.average.return_weights(trainer, pl_module)
 
 
