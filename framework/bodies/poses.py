@@ -76,9 +76,10 @@ MOVEMENTS = (*CENTRAL, *(f"{side} {name}" for side in ("left", "right") for name
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Indices of a body's joints by their roles in a movement: each field holds the joints that a movement rotates.
+    """Indices of a body's joints by their roles: each field holds the joints that movements of this role rotate.
 
-    A field with two joints holds (left, right). The joints of `spine`, and those of `neck`, share a rotation equally.
+    For example, the movement "left elbow" rotates `elbow[0]`. A field with two joints holds (left, right). The joints
+    of `spine`, and those of `neck`, share a rotation equally.
     """
 
     root: int
@@ -137,7 +138,7 @@ def skeleton(body: Body) -> Skeleton:
     The joints are found by name in the default body, and by their order if they have no names (the SMPL family).
 
     Raises:
-        DataError: there are fewer than 22 joints without names, or names of another body.
+        DataError: the joints have no names and are fewer than 22, or a joint of the default body is missing.
     """
     if not body.names:
         if len(body.parents) < 22:

@@ -508,9 +508,12 @@ def refuse_listed(wrong: Sequence[object], problem: str, remedy: str) -> None:
 
 
 def vary(batch: Batch, signs: Sequence[float], jitter: float) -> Batch:
-    """Augment the images of a training batch (see `augment`) and, if `signs` is not empty, mirror half of them.
+    """Augment the images of a training batch and, if `signs` is not empty, mirror half of them.
 
-    The angles of a mirrored image are multiplied by `signs`, which holds 1 or -1 for each angle.
+    Args:
+        batch: fields of the samples, among them "input" and "target" (angles).
+        signs: 1 or -1 for each angle; the angles of a mirrored image are multiplied by these.
+        jitter: largest shift and change of size, as a share of the image's side (`augment`).
     """
     if not signs and not jitter:
         return batch

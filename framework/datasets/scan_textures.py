@@ -26,10 +26,9 @@ CACHED = 16
 
 
 class Textures:
-    """Textures that are looked up by the colours of the registered vertices, which identify a subject.
+    """Textures of subjects, looked up by the colours of the registered vertices, which identify a subject.
 
-    A texture is therefore never drawn on another subject, even if the lists of subjects have another order or the
-    folder is another one.
+    A texture is therefore never drawn on another subject, even if a folder or its lists of subjects are exchanged.
 
     Args:
         root: folder of the subjects, in the layout of `framework.datasets.scan_layout`.

@@ -93,7 +93,7 @@ class Shards:
 
 
 def trim(clouds: Tensor) -> Tensor:
-    """Return a batch of clouds without the last rows that are NaN in every cloud, or any other batch unchanged."""
+    """Return a batch of clouds without the last rows that are NaN in every cloud; other batches are not changed."""
     if clouds.dim() != 3 or not clouds.is_floating_point() or not clouds[:, -1:].isnan().all():
         return clouds
     used = (~clouds.isnan().all(-1)).any(0).nonzero()

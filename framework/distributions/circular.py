@@ -57,13 +57,14 @@ def circular_mean(angle: Tensor, dim: int = -1) -> Tensor:
 def circular_median(samples: Float[Tensor, "samples *batch"]) -> Float[Tensor, "*batch"]:
     """Return the sample with the least mean angular deviation from all S samples (thesis eq. 3.24), exactly.
 
-    The sum of angular distances Δ from an angle θ to the samples φ_k, F(θ) = Σ_k Δ(θ, φ_k), is piecewise linear. Its
-    kinks are convex at the samples and concave at the angles opposite to them. So its minimum over the whole circle
-    lies at a sample, and this sample is the exact circular median.
+    The sum of angular distances Δ from an angle θ to the samples φ_k, F(θ) = Σ_k Δ(θ, φ_k), is piecewise linear. The
+    kinks of F are convex at the samples and concave at the angles opposite to them. So the minimum of F over the whole
+    circle lies at a sample, and this sample is the exact circular median.
 
-    The samples are sorted, in O(S log S). The samples within half a turn ahead of φ_j are then consecutive and start at
-    j. Differences of prefix sums over two turns give the sum of their distances from φ_j, and the sum for all other
-    samples. Of several minima, the smallest angle in [-π, π) is returned. If a sample is not finite, the result is NaN.
+    The samples are sorted, in O(S log S). The samples within half a turn ahead of φ_j are then consecutive, and φ_j is
+    the first of them. The sum of their distances from φ_j is computed from prefix sums of the sorted angles over two
+    turns, and so is the sum of the distances of all other samples. Of several minima, the smallest angle in
+    [-π, π) is returned. If a sample is not finite, the result is NaN.
     """
     count = samples.shape[0]
     if count == 0:

@@ -118,10 +118,10 @@ class CircularMoments:
 def circular_moments(density: Distribution) -> CircularMoments:
     """Return the trigonometric moments of a density of one angle.
 
-    They come from `protocol.trigonometric_moments`, if it knows them, and otherwise from the trapezium rule on a grid,
-    which is spectrally exact for smooth densities. Items of the batch that the coarse grid does not resolve are
-    evaluated on the fine grid. The other items keep their moments from the coarse grid, so that these do not depend on
-    the rest of the batch.
+    If `protocol.trigonometric_moments` knows the moments, they are returned. Otherwise they are computed by the
+    trapezium rule on a grid, which is spectrally exact for smooth densities. Items of the batch that the coarse grid
+    does not resolve are evaluated on the fine grid. The other items keep their moments from the coarse grid, so that
+    the moments of an item do not depend on the rest of the batch.
 
     Raises:
         ValueError: the density is not over one angle.

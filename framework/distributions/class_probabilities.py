@@ -17,8 +17,8 @@ LARGEST_DEFECT = 0.01
 def class_probabilities(density: Distribution) -> Float64[Tensor, "batch class"]:
     """Return p(y = k) for each sample and class k, in [0, 1]; the sum over the classes is 1 in float64.
 
-    The probabilities are exp of log_prob at each class, in float64, divided by their sum. Before this division, the
-    sums differ from 1: by 1e-7 for a float32 log_prob, by 1e-3 if its logits reach 1e4, and by a random amount if
+    For each class, exp(log_prob) is computed in float64 and divided by the sum over all classes. Before this division,
+    the sum differs from 1: by 1e-7 for a float32 log_prob, by 1e-3 if its logits reach 1e4, and by a random amount if
     log_prob of each class is estimated from draws (`estimate`). Before the division, the largest probability of a
     mixture may exceed 1 by the same amounts.
 

@@ -236,7 +236,7 @@ def _log_shares(logits: Tensor) -> Tensor:
 
 
 def estimate_of_sum(parts: protocol.Estimate, log_terms: Tensor, log_sum: Tensor) -> protocol.Estimate:
-    """Return the estimate of log Σ_k t_k from the estimates of the terms t_k; k is the last dimension.
+    """Return the estimate of log Σ_k t_k from the estimates of log t_k; k counts along the last dimension.
 
     The terms must be estimated from independent draws. By the delta method, the squared standard error of the log-sum
     is Σ_k (t_k / Σ_j t_j)² s_k², where s_k is the standard error of log t_k. The numbers of samples add up.

@@ -188,8 +188,8 @@ class Density:
     def edges(self) -> Array:
         """Return the ends of the panels of a quadrature of one number, ascending, (edge, *batch).
 
-        The ends are at distances from the peaks that grow by a constant factor; the ends of angles span the circle. The
-        distances from many peaks are rounded, so that few panels remain where peaks overlap.
+        The distances of the ends from the peaks grow by a constant factor. For an angle, the first and the last end are
+        one turn apart. If there are many peaks, the ends are rounded, so that few panels remain where peaks overlap.
         """
         place, width = self.peaks()
         steps = np.concatenate(

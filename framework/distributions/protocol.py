@@ -7,8 +7,8 @@ on the type of the density, so that the author of a density registers what is kn
     @marginal.register
     def _(density: Mine, index: int) -> Mine: ...
 
-**No default claims to be exact.** A default that cannot compute a quantity exactly returns draws, an error of NaN or
-None ("not known in closed form; use draws"), or it raises a `UserError` that says what to register. A subclass inherits
+**No default claims to be exact.** A default that cannot compute a quantity exactly returns draws, an error of NaN, or
+None ("not known in closed form; use draws"). Or it raises a `UserError` that says what to register. A subclass inherits
 the functions that are registered for its base. Densities that are made of other densities (`density.Mixture`,
 `batch_shapes.Stacked`, `batch_shapes.Reshaped`, `tempering.CircularPower`) call the function for each of these. The
 functions for torch's own densities are registered in `closed_forms`.
@@ -124,7 +124,7 @@ def recentre(density: Distribution, index: tuple[Tensor, ...], origin: Tensor) -
         density: density of one number, event_shape (1,).
         index: indices of the items, int64, one tensor for each batch dimension; broadcast together they have the shape
             (*items).
-        origin: (*items, 1).
+        origin: value that is subtracted, (*items, 1).
     """
     return _Recentred(density, index, origin)
 
@@ -338,7 +338,7 @@ class Region(NamedTuple):
 def highest_region(
     density: Distribution, value: Tensor, mass: float, equal: Mapping[torch.dtype, float]
 ) -> Region | None:
-    """Return highest-density regions of one number; None if they are not known in closed form (the default).
+    """Return highest-density regions of a density of one number; None if no closed form is known (the default).
 
     Args:
         density: a density of one number, with batch_shape (*batch).
@@ -497,8 +497,8 @@ class ValueSet(ABC):
 def value_set(density: Distribution) -> ValueSet | None:
     """Return the prediction sets of a density, one for each item of its batch; None if it has none.
 
-    The default returns None. A mixture, a power or a marginal of a density with sets has no sets either, since a
-    guarantee for the density does not hold for them. An affine transform (`affine.AffineDensity`) has the transformed
+    The default returns None. A mixture, a power or a marginal of a density with sets has no sets, since a guarantee
+    for this density does not hold for the changed one. An affine transform (`affine.AffineDensity`) has the transformed
     sets.
     """
     return None

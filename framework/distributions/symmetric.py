@@ -11,7 +11,7 @@ class Symmetric(PlainDensity):
     """Base class of densities whose mean, mode and median are their `location`.
 
     Args:
-        location: (*batch, *event).
+        location: point of symmetry, (*batch, *event).
         event_dimensions: number of dimensions of an event.
     """
 

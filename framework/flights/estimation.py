@@ -143,7 +143,7 @@ def cauchy(residual: Float[Tensor, "*shape"]) -> tuple[Float[Tensor, "*shape"], 
 def guess_states(frames: ObservedFrames, gravity: float) -> Float[Tensor, "flight 9"]:
     """Return an initial guess of the state at the first frame.
 
-    Its velocity consists of medians of the slopes between pairs of the first FIRST observed frames (Theil 1950; Sen
+    The velocity consists of medians of the slopes between pairs of the first FIRST observed frames (Theil 1950; Sen
     1968), which hardly change if up to a third of the frames are outliers. The spin is 0. If fewer than two frames are
     observed, the velocity is 0; if none is observed, the position is 0 too.
     """

@@ -26,13 +26,13 @@ class Constants:
     constants that this simulator has.
 
     Attributes:
-        gravity: m/s².
+        gravity: acceleration of gravity, m/s².
         drag: k of the deceleration k |v| v, 1/m (Mülling et al. 2011, eq. 1).
         lift: m of the Magnus acceleration m ω × v, dimensionless: ρ A r c / (2 · mass) with the density ρ of air, the
             ball's cross-section A and radius r, and the lift coefficient c = 0.6.
         spin_decay: rate k of the exponential decay of the spin ω, dω/dt = -k ω, 1/s.
         restitution: upward speed after the bounce divided by downward speed before it.
-        friction: Coulomb's coefficient of ball and table.
+        friction: Coulomb's coefficient of friction between ball and table.
         radius: radius of the ball, m.
         surface: height of the table, m, in the frame of the recordings.
         near: y at which the table begins, m. Before `near` and beyond `far` there is no bounce.

@@ -23,8 +23,8 @@ class Camera:
     A world point X is seen at pixel (fx x/z + cx, fy y/z + cy), where (x, y, z) = rotation @ X + translation.
 
     Attributes:
-        rotation: world to camera, determinant +1.
-        translation: metres.
+        rotation: rotation from world to camera coordinates, determinant +1.
+        translation: translation from world to camera coordinates, metres.
         focal: (fx, fy), pixels, > 0; a tensor if its gradient is wanted.
         principal: (cx, cy), pixels; the centre of an image is ((width - 1) / 2, (height - 1) / 2). A tensor if its
             gradient is wanted.
@@ -157,9 +157,9 @@ def look_from(
         azimuth: rotation about the vertical, radians; at 0 the camera looks at the object's front, from -y.
         elevation: angle of the camera above the horizontal, radians.
         tilt: rotation of the camera in the image plane, radians.
-        distance: metres.
-        field_of_view: vertical, radians.
-        size: (height, width), pixels.
+        distance: distance of the camera from the origin, metres.
+        field_of_view: vertical field of view, radians.
+        size: (height, width) of the image, pixels.
 
     Raises:
         ValueError: `field_of_view` is not between 0 and π; it may be in degrees.

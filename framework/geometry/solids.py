@@ -216,7 +216,7 @@ def tray(
     Args:
         width: size of the rim along x.
         depth: size of the rim along y.
-        height: height.
+        height: distance between bottom and rim.
         wall: thickness of the walls.
         floor: thickness of the floor.
         at: middle of the bottom.

@@ -33,7 +33,8 @@ MOST = 2 * quadrature.PEAKS * sum(quadrature.NODES)
 def log_marginal(angle: Float[Tensor, "..."], frame: Frame, index: int) -> Float[Tensor, "..."]:
     """Return the log-density of azimuth (index 0), elevation (1) or tilt (2), radians; nats, float64.
 
-    The batch shape of `frame` broadcasts with the shape of `angle`.
+    `frame` describes the matrix Fisher density of the rotation (`aligned_rotations.align`). The batch shape of `frame`
+    broadcasts with the shape of `angle`.
 
     For each of the three angles α, the aligned quaternion q is a linear function of the pair (cos α/2, sin α/2), so
     that Σ λᵢqᵢ² is a quadratic form of this pair. With the smaller and larger eigenvalues μ and ν of the form, the

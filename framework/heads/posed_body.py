@@ -20,7 +20,8 @@ class BodyFit:
 
     Attributes:
         parameters: parameters of the body at the end of the fit.
-        difference: root mean square difference between the rendered image and the given one at the end.
+        difference: root mean square difference of colours between the given image and the rendered one at the end of
+            the fit.
         path: one row for each accepted step. Its columns are the loss, the processor time since the start (seconds) and
             the parameters.
     """
@@ -35,7 +36,7 @@ class PosedBodyDensity(Independent):
 
     Args:
         mean, scale: parameters at the end of each fit, and their standard deviations, (*batch, parameter).
-        fits: fit of each image, in the order of the flattened batch; None if the input was no image of a body.
+        fits: fit of each image, in the order of the flattened batch; None for an input that was no image of a body.
         body_model, renderer, camera: body that the parameters describe, and how it is rendered.
     """
 

@@ -75,7 +75,7 @@ class Bench(NamedTuple):
     Attributes:
         key: cell of each point.
         count: number of points in each cell, one row for each thread.
-        crowded: begin and end of each crowded cell in the sorted points.
+        crowded: for each cell with more than CROWD points, begin and end of its points among the sorted points.
     """
 
     key: NDArray[np.int32]
@@ -270,7 +270,7 @@ def places(count, bits, cells, crowded):
         crowded: filled with begin and end of each cell with more than CROWD points.
 
     Returns:
-        The number of crowded cells.
+        The number of cells with more than CROWD points.
     """
     start = (8**bits - 8) // 7
     place = np.int32(0)
@@ -320,12 +320,14 @@ def scatter(cloud, size, begin, end, key, count, points, ids):
 @compiled
 @no_type_check
 def sort_crowded(points, crowded, crowded_count, cells):
-    """Sort the records of each crowded cell with a grid of its own; cells of this grid that are crowded are sorted too.
+    """Sort the records of each cell with more than CROWD points again, with a grid of its own.
+
+    Cells of this grid with more than CROWD points are sorted in the same way.
 
     Args:
         points: records x y z id, sorted in place.
-        crowded: begin and end of each crowded cell; used as a stack.
-        crowded_count: number of crowded cells.
+        crowded: begin and end of each cell with more than CROWD points; used as a stack.
+        crowded_count: number of these cells.
         cells: table from `curve`, the cells of each grid in the order of the Hilbert curve.
     """
     largest = 0

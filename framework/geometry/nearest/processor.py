@@ -109,7 +109,7 @@ def search_clouds(problem, begin, end, cells, work, packed, own):
     """Search clouds begin…end of a batch, one after the other, and write distance, index and outcome of each.
 
     Args:
-        problem: the batch.
+        problem: the batch of clouds and queries.
         begin: index of the first cloud.
         end: index after the last cloud.
         cells: table from `pack.curve`, the cells of each grid in the order of the Hilbert curve.
@@ -155,7 +155,7 @@ def search_clouds_share(problem, counter, step, limit, cells, work, packed, own)
     """Search a part of a batch in one thread, until it has searched `limit` clouds or no cloud is left.
 
     Args:
-        problem: the batch.
+        problem: the batch of clouds and queries.
         counter: index of the next cloud, (1,) int64, which all threads share and increase.
         step: number of clouds that a thread takes at a time.
         limit: number of clouds after which this call ends.
@@ -181,7 +181,7 @@ def search_share(packed, packets, counter, step, distance, index):
 
     Args:
         packed: the cloud.
-        packets: packed queries.
+        packets: packed queries; a packet holds sixteen neighbouring queries.
         counter: index of the next packet, (1,) int64, which all threads share and increase.
         step: number of packets that a thread takes at a time.
         distance: filled with the distance of the nearest point to each query, at the row of the query.
@@ -203,7 +203,7 @@ def search_all_share(cloud, size, packets, counter, step, distance, index):
     Args:
         cloud: coordinates of the points, x y z x y z …, (3 · points,).
         size: number of points.
-        packets: packed queries.
+        packets: packed queries; a packet holds sixteen neighbouring queries.
         counter: index of the next packet, (1,) int64, which all threads share and increase.
         step: number of packets that a thread takes at a time.
         distance: filled with the distance of the nearest point to each query, at the row of the query.
@@ -276,7 +276,7 @@ KEPT = 2**20
 
 
 class Desks(local):
-    """Working memory of each thread, kept between searches, because its allocation takes a large part of their time."""
+    """Working memory of each thread, kept between searches, since its allocation takes long compared to a search."""
 
     def __init__(self) -> None:
         self.cached: dict[tuple[int, int, np.dtype, int], tuple[Bench, Packed, Packed]] = {}

@@ -154,7 +154,7 @@ def children(level, node, levels):
     Args:
         level: level of the children.
         node: index of the node within the level above.
-        levels: `Packed.levels`.
+        levels: first node and number of nodes of each level (`Packed.levels`).
     """
     return levels[level] + 16 * node, (1 << min(16, levels[8 + level] - 16 * node)) - 1
 
@@ -165,7 +165,7 @@ def nearest_bit(open_, gaps, at):
     """Return the index of the nearest child whose bit is set in `open_`, and its distance.
 
     Args:
-        open_: a bit for each of 16 children.
+        open_: int64 with a bit for each of 16 children.
         gaps: array with the 16 distances of the children, from index `at` on.
         at: index of the first distance.
     """
@@ -186,8 +186,8 @@ def search_alone(packed, level, node, query, best, leaf, opened, gaps):
         query: coordinates x, y, z of the query.
         best: smallest squared distance so far.
         leaf: leaf in which the point at this distance was found.
-        opened: working memory: open children of each level.
-        gaps: working memory: distances of the children of each level.
+        opened: working memory for the children of each level that must still be searched.
+        gaps: working memory for the distances of the children of each level.
 
     Returns:
         The smallest squared distance, its leaf, and true if another point may be at this distance.
@@ -304,7 +304,7 @@ def open_node(box, nodes, start, valid, low, high, query, best, worst, near, at)
         box: boxes of all nodes (`Packed.box`).
         nodes: number of all nodes.
         start: index of the first child.
-        valid: bits of the children that exist.
+        valid: int64 with a bit set for each child that exists.
         low: lowest x, y, z of the sixteen queries.
         high: highest x, y, z of the sixteen queries.
         query: vectors x, y, z of the queries.
@@ -332,7 +332,7 @@ def search(packed, packets, begin, end, distance, index):
 
     Args:
         packed: the cloud.
-        packets: packed queries.
+        packets: packed queries; a packet holds sixteen neighbouring queries.
         begin: index of the first packet.
         end: index after the last packet.
         distance: filled with the distance for each query, at the id of the query.
@@ -479,7 +479,7 @@ def search_all(cloud, size, packets, begin, end, distance, index):
     Args:
         cloud: coordinates of the points, x y z x y z …, (3 · points,).
         size: number of points.
-        packets: packed queries.
+        packets: packed queries; a packet holds sixteen neighbouring queries.
         begin: index of the first packet.
         end: index after the last packet.
         distance: filled with the distance for each query, at the id of the query.
