@@ -1,8 +1,8 @@
 """Inverse linear blend skinning, which moves the vertices of a registered mesh to the rest pose (thesis §7.4.3).
 
-The thesis computes a template of every subject, W⁻¹(X) - B_P(θ): its mesh X without skinning W and without the pose
-blend shapes B_P. Here this template is written as the model's template plus offsets. The model with these offsets then
-gives the subject in other poses and with other shape coefficients.
+The thesis computes a template of every subject, W⁻¹(X) - B_P(θ): the subject's mesh X without skinning W and without
+the pose blend shapes B_P. Here this template is written as the model's template plus offsets. The model with these
+offsets then gives the subject in other poses and with other shape coefficients.
 """
 
 from typing import NamedTuple

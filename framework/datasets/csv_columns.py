@@ -1,9 +1,9 @@
 """A CSV table of numbers and words, by columns; error messages name the line and the column.
 
 `framework.storage.text` decides which words are numbers. `Writing` is the part of the config that describes the
-notation of a user's table. A column that holds no numbers is reported (`ColumnChoice.left_out`): it holds words, row
-numbers, or nothing. A column whose cells would be numbers in another notation is refused, and the message names the
-setting that reads it.
+notation of a user's table. A column that holds words, row numbers or nothing is left out and reported
+(`ColumnChoice.left_out`). A column whose cells would be numbers in another notation is refused, and the message names
+the setting that reads it.
 """
 
 import csv

@@ -285,8 +285,8 @@ def _(density: Mixture, index: int) -> Distribution:
 def _(density: Mixture, samples: int) -> Tensor:
     """Return the median of a mixture.
 
-    It is computed without draws for a single component whose median is known, and for components over one real number
-    whose distribution function is known. For all others it is the median of draws (the default of `median`).
+    No draws are needed for a single component whose median is known, and for components over one real number whose
+    distribution function is known. For all others, the result is the median of draws (the default of `median`).
 
     For several components over images, the mean is returned instead, as `framework.deployment.frozen.Frozen` does: the
     median of few draws is a noisy image, and the median from the distribution function takes a second of processor

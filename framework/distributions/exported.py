@@ -101,8 +101,8 @@ class Exported:
 def exported(density: Distribution) -> Exported:
     """Return a density as tensors, whose computation torch can trace.
 
-    A density whose log_prob is a function of tensors registers its own function. It also names a module of NumPy code
-    if its family is not in `numpy_densities`. By default, a density cannot be exported.
+    A density whose log_prob is a function of tensors registers its own function. This function also names a module of
+    NumPy code if the family of the density is not in `numpy_densities`. By default, a density cannot be exported.
 
     Raises:
         ConfigError: the density has not registered a function, for example because it draws random numbers.

@@ -211,7 +211,7 @@ class Estimate(NamedTuple):
 def estimate_with_error(
     log_mean: Tensor, standard_error: Tensor, samples: Tensor, unresolved: Tensor
 ) -> Estimate:
-    """Return an estimate with `debiased` computed from the error; it is `log_mean` where the error is infinite."""
+    """Return an estimate with `debiased` computed from the error, or equal to `log_mean` if the error is infinite."""
     correction = torch.where(standard_error == math.inf, 0.0, standard_error.square() / 2)
     return Estimate(log_mean, log_mean + correction, standard_error, samples, unresolved)
 

@@ -98,8 +98,8 @@ def _(density: Mixture, temperature: Tensor) -> Distribution:
     """Return the tempered mixture: over classes it is tempered as a whole, otherwise component by component.
 
     Tempering a component keeps its weight w_k. The power of a sum Σ w_k p_k over real numbers or angles has no
-    normaliser in closed form. The mixture of the tempered components is normalised because they are. It equals p at T =
-    1, and is exact for one component. Modes that different components describe remain separate.
+    normaliser in closed form. The mixture of the tempered components is normalised, since each component is. This
+    mixture equals p at T = 1, and is exact for one component. Modes that different components describe remain separate.
     """
     if density.has_enumerate_support:
         return tempered_classes(density, temperature)

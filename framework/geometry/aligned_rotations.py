@@ -98,7 +98,8 @@ def mean_rotation(parameter: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*bat
 def entropy(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
     """Return the entropy -E log p = log k(λ) + Σ λᵢ E qᵢ² of a matrix Fisher density with λ = `falls`, nats.
 
-    The density is with respect to the rotation-invariant measure of total mass 1. Its entropy is therefore at most 0.
+    The density is with respect to the rotation-invariant measure of total mass 1. The entropy of such a density is at
+    most 0.
     """
     return log_height(falls).neg() + (falls * second_moments(falls)).sum(-1)
 

@@ -78,9 +78,10 @@ class Camera:
         camera is not needed any more.
 
         With (x, y, z) = rotation @ X + translation, and with the focal length f and the principal point (c, d) of the
-        canonical camera, the new coordinates are ((fx x + (cx - c) z) / f, (fy y + (cy - d) z) / f, z). Their pixel
-        column f x'/z + c equals fx x/z + cx, and the row likewise. The coordinates are differentiable in `points`,
-        `focal` and `principal`. Integers are converted to torch's default float type.
+        canonical camera, the new coordinates are ((fx x + (cx - c) z) / f, (fy y + (cy - d) z) / f, z). Let x' be the
+        first of them. The canonical camera sees the point at the pixel column f x'/z + c, which equals fx x/z + cx. The
+        same holds for the row. The coordinates are differentiable in `points`, `focal` and `principal`. Integers are
+        converted to torch's default float type.
 
         Raises:
             ValueError: `rotation`, `translation`, `focal` or `principal` has a wrong shape.

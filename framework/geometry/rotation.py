@@ -21,9 +21,9 @@ def geodesic_distance(
 ) -> Float[Tensor, "*batch"]:
     """Return the angle between two rotations R₁ and R₂, radians in [0, π]: ||log(R₁ᵀR₂)||_F / √2 (Tulsiani & Malik).
 
-    The angle is accurate near 0, where the arc cosine of the trace of R₁ᵀR₂ would lose half the digits. It is accurate
-    near π too, where cos(angle / 2) would lose them if it were computed from the trace. For angles above 2π/3 this
-    cosine is sin(angle) / (2 sin(angle / 2)), with sin(angle) from the antisymmetric part of R₁ᵀR₂.
+    The angle is accurate near 0, where the arc cosine of the trace of R₁ᵀR₂ would lose half the digits. The angle is
+    accurate near π too, where cos(angle / 2), if computed from the trace, would also lose half the digits. For angles
+    above 2π/3 this cosine is sin(angle) / (2 sin(angle / 2)), with sin(angle) from the antisymmetric part of R₁ᵀR₂.
     """
     chord = torch.linalg.matrix_norm(first - second) / 8**0.5  # sin(angle / 2)
     trace = (first * second).sum((-2, -1))

@@ -1,8 +1,8 @@
 """Grid of rotations with cells of equal volume: HEALPix pixels of directions, times arcs of a circle.
 
-A rotation is described by azimuth a, elevation e and tilt t (`framework.geometry.rotation.viewpoint_rotation`). Its
-invariant measure is cos e da de dt / 8π². Directions (sin e, t) are divided into HEALPix pixels of equal area (Górski
-et al. 2005), and the third coordinate into arcs of equal length, as Yershova et al. 2010 do.
+A rotation is described by azimuth a, elevation e and tilt t (`framework.geometry.rotation.viewpoint_rotation`). The
+invariant measure of rotations is cos e da de dt / 8π². Directions (sin e, t) are divided into HEALPix pixels of equal
+area (Górski et al. 2005), and the third coordinate into arcs of equal length, as Yershova et al. 2010 do.
 
 The third coordinate is ψ = a - sin e · (t - tᵢ), where tᵢ is the tilt at the centre of the pixel. The shift of a does
 not change volumes. Without it, cells at the poles would be long: at e = π/2 only t - a determines the rotation, and at

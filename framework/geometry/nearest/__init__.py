@@ -341,8 +341,8 @@ def chamfer(
 ) -> Float[Tensor, "batch"]:
     """Return the Chamfer distance of clouds `a` and `b`, one for each item of the batch (thesis eq. 6.6).
 
-    It is the mean squared distance from the points of `a` to their nearest points of `b`, plus the same with `a` and
-    `b` exchanged. It is differentiable.
+    This is the mean squared distance from the points of `a` to their nearest points of `b`, plus the same mean with `a`
+    and `b` exchanged. The result is differentiable in both clouds.
 
     Args:
         a: clouds, (batch, points, 3).
