@@ -178,9 +178,10 @@ class RandomSearch(Search):
     Args:
         trials: number of different trials; if the search space has fewer points, every point is run once.
         seed: seed of the draws.
-        metric: as for `Search`.
-        direction: as for `Search`.
-        params: as for `Search`.
+        metric: key of results.json by which trials are ranked; None: the value that a job returns, its best validation
+            loss in nats. A list of two keys asks for the Pareto front.
+        direction: "minimize" or "maximize", for each metric; None: the direction that the metric declares.
+        params: sweeps by key, in Hydra's grammar; a sweep of the same key on the command line takes precedence.
     """
 
     def __init__(
@@ -215,9 +216,10 @@ class OptunaSearch(Search):
         trials: number of different trials of the study, together with those of earlier and other commands.
         seed: seed of the sampler.
         sampler: "tpe", "random", "quasi_random" or "nsga2".
-        metric: as for `Search`; with the sampler "nsga2", None stands for the value that a job returns and its
-            milliseconds per sample.
-        direction: as for `Search`.
+        metric: key of results.json by which trials are ranked; None: the value that a job returns, its best validation
+            loss in nats; with the sampler "nsga2" this value and the milliseconds per sample. A list of two keys asks
+            for the Pareto front.
+        direction: "minimize" or "maximize", for each metric; None: the direction that the metric declares.
         batch: number of trials that are suggested and run together; None: as many as the launcher runs at once, or all
             trials if the sampler does not depend on the values of earlier ones.
         population: number of trials of a generation of "nsga2"; None: a fifth of the trials, at least 4 and at most 50.
@@ -225,7 +227,7 @@ class OptunaSearch(Search):
             trials; None: every trial is trained to its end.
         storage: address of a PostgreSQL database, without password; None: a file in the folder of the sweep.
         study: name of the study in the database; None: the folder of the sweep.
-        params: as for `Search`.
+        params: sweeps by key, in Hydra's grammar; a sweep of the same key on the command line takes precedence.
     """
 
     # More than eight parameters: each keyword is a config key that a user sets alone.

@@ -25,8 +25,8 @@ def counts(key: str) -> bool:
 def write_best(folder: Path, overrides: Sequence[str], loader: ConfigLoader, origin: str) -> None:
     """Write the experiment of the best trial, which has `overrides`, to best.yaml in `folder`.
 
-    A copy is written to the subfolder `experiment`, where Hydra finds it with `--config-dir=<folder>`. `loader` and
-    `origin` are as in `build_experiment`.
+    A copy is written to the subfolder `experiment`, where Hydra finds it with `--config-dir=<folder>`. `loader` is
+    Hydra's configuration loader, and `origin` a line that says where the experiment comes from.
     """
     name, content = build_experiment(overrides, loader, origin)
     path = folder / "best.yaml"

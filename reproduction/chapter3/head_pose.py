@@ -87,7 +87,7 @@ def read_results(folders: list[Path]) -> list[dict[str, Any]]:
 
 
 def difference_table(rows: list[dict[str, Any]]) -> str:
-    """Return a table of the differences between each method and fixed κ on the same data and seed."""
+    """Return a table of the differences between each method and the method with fixed κ, on the same data and seed."""
     lines = [
         "| layout, angle | method | gain in log-likelihood, nats | decrease of MAAD, ° | seeds |",
         "|---|---|---:|---:|---:|",

@@ -120,7 +120,7 @@ def measure_empty(clouds: Tensor) -> list[dict[str, object]]:
 
 
 def move_points(clouds: Tensor, share: float, far: float) -> Tensor:
-    """Move a share of the points of each cloud: to random places in the ball if `far` is 1, else to `far` radii."""
+    """Move a share of each cloud's points: anywhere into the unit ball if `far` is 1, else to the radius `far`."""
     generator = torch.Generator().manual_seed(2)
     count = math.ceil(share * clouds.shape[1])
     towards = torch.randn(len(clouds), count, 3, generator=generator)

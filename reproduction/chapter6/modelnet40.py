@@ -265,9 +265,9 @@ def weighted_score(
 ) -> tuple[float, float]:
     """Return Σ weight · mean score, and its standard error for new test clouds and new seeds.
 
-    All methods have the same clouds. Their part of the variance is therefore that of Σ weight · score over clouds, with
-    scores averaged over seeds. Every method has seeds of its own, so that their part is
-    Σ weight² · (pooled variance) / seeds. This part is left out if no row has several seeds.
+    All methods have the same clouds. The part of the variance that the clouds cause is therefore that of Σ weight ·
+    score over clouds, with scores averaged over seeds. Every method has seeds of its own, so that the part that the
+    seeds cause is Σ weight² · (pooled variance) / seeds. The second part is left out if no row has several seeds.
     """
     among_seeds = np.nan_to_num(pooled_seed_variance(methods, score))
     cloud_scores = sum(weight * getattr(methods[key], score).mean(0) for key, weight in weights.items())

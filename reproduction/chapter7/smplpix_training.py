@@ -1,10 +1,10 @@
-"""Measure what rendering networks gain with training time, against meshes.
+"""Measure what rendering networks gain with training time, and compare them with rasterised meshes.
 
     python -m reproduction.chapter7.smplpix_training [--skins <folder>]
 
 The script trains the runs that outputs/smplpix_training does not hold yet, which takes up to five hours of one core,
-and continues after an interruption. With `--there` it trains nothing. A row of smplpix_training.csv stays unchanged
-until its runs exist again.
+and continues after an interruption. With `--there` it trains nothing. A row of smplpix_training.csv whose runs do not
+exist stays unchanged.
 """
 
 import argparse

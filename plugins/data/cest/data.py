@@ -214,7 +214,8 @@ class CEST(Data, Mapped):
     def write_maps(self, file: Path, point: Tensor, deviation: Tensor, folder: Path) -> Sequence[Path]:
         """Write the maps of the predictions for a volume and return the paths of the files.
 
-        The arguments are those of `plugins.data.cest.maps.write_maps`.
+        `point` and `deviation`, (voxel, number), are the point predictions and standard deviations of the voxels of
+        `file`, in the order in which `read_volume` returns them. The files are written to `folder`.
         """
         from plugins.data.cest.maps import write_maps
 

@@ -61,8 +61,8 @@ def maps_of(
 ) -> dict[str, np.ndarray]:
     """Return the maps (x, y, z) by name, NaN where there is no voxel; amplitudes are shares of the unsaturated signal.
 
-    The maps are the asymmetry, each predicted number, and each standard deviation. `names`, `point` and `deviation` are
-    as in `write_maps`.
+    The maps are the asymmetry, each predicted number, and each standard deviation. `point` holds the point predictions
+    of the volume's voxels, `deviation` their standard deviations, and `names` the names of the predicted numbers.
     """
     columns = {ASYMMETRY: asymmetry(volume)}
     for number, name in enumerate(names):
@@ -84,7 +84,7 @@ def asymmetry(volume: Volume) -> Float[np.ndarray, "voxel"]:
 
 
 def slice_of(maps: Mapping[str, np.ndarray], volume: Volume) -> Maps:
-    """Return the maps that the figure shows, and their standard deviations, of the slice with the most voxels.
+    """Return the contrast maps that the figure shows, with standard deviations, of the slice with the most voxels.
 
     The maps are cropped to the voxels of that slice. The asymmetry has no standard deviation (None).
     """

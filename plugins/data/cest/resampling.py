@@ -20,8 +20,8 @@ def resample(
 ) -> Float[np.ndarray, "voxel required"]:
     """Return the spectra at the model's offsets.
 
-    Spectra whose offsets are already the model's stay unchanged. Others are interpolated by piecewise cubics that do
-    not overshoot (Fritsch & Carlson 1980).
+    Spectra that were measured at the model's offsets stay unchanged. Other spectra are interpolated by piecewise cubics
+    that do not overshoot (Fritsch & Carlson 1980).
 
     Args:
         spectra: The measured spectra.

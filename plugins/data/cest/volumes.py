@@ -63,7 +63,7 @@ class Volume(NamedTuple):
 
 
 def read_volume(file: Path) -> Volume:
-    """Read the spectra of one file, divided by M0, the unsaturated signal, if the file holds it.
+    """Read the spectra of one file; if the file holds M0, the unsaturated signal, the spectra are divided by it.
 
     Raises:
         DataError: The file is missing, damaged, of another layout, or holds no voxel.

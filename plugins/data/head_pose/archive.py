@@ -83,7 +83,7 @@ class Source:
         return cache.folder(self.archive.name) if self.root is None else None
 
     def fingerprint(self, synthetic: bool) -> dict[str, str]:
-        """Return root and version of the images, for `Data.fingerprint`.
+        """Return the entries "root" (source) and "version" of `Data.fingerprint`.
 
         Args:
             synthetic: Whether the images are synthetic, in a user's folder or in the cache.
@@ -128,7 +128,7 @@ def draw_train_and_test(
     name: str,
     draw: Callable[[int], tuple[str, NDArray[np.uint8], Label]],
 ) -> dict[str, list[Label]]:
-    """Write JPEG images into train/ and test/, and return the labels of both folders in the order of the images.
+    """Write JPEG images into train/ and test/, and return the labels of each folder in the order of its images.
 
     Args:
         root: Folder to write into.

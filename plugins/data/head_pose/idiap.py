@@ -39,7 +39,7 @@ class Idiap(Heads):
         generator_seed: Seed of the generated images.
 
     Raises:
-        ConfigError: degrees are expected of generated labels.
+        ConfigError: `angles_in` is "degrees", but the labels are generated, in radians.
     """
 
     bibtex = "ba2005evaluation, tosato2013characterizing"
@@ -87,7 +87,7 @@ def random_pose(random: np.random.Generator) -> Pose:
 
 
 def random_people(seed: int) -> list[Person]:
-    """Return random people; both splits show the same people, as frames of the same recordings would."""
+    """Return random people; training and test images show the same people, as frames of the same recordings would."""
     return [
         synthetic_heads.random_person(np.random.default_rng([seed, 1, number])) for number in range(PEOPLE)
     ]

@@ -81,7 +81,7 @@ class Labels(NamedTuple):
     Attributes:
         samples: Labelled images by split; without "validation" the published test set is halved.
         faults: Errors of labels that could not be read; they count as unreadable images.
-        left_out: Clause about images that were left out for other reasons; it is part of the message about an empty
+        left_out: Clause about images that the labels themselves exclude; it is part of the message about an empty
             split.
     """
 
@@ -93,7 +93,8 @@ class Labels(NamedTuple):
 class Heads(Data):
     """Base class of data sets of head images; a data set adds its constructor, its citation, and `read_labels`.
 
-    The constructor sets `source`, `reading`, `target`, and, if training shows mirror images, `signs`.
+    The constructor sets `source`, `reading` and `target`. If training shows mirror images, it also sets `signs`, the
+    factor of each angle in a mirror image.
     """
 
     suffixes = images.SUFFIXES
@@ -147,9 +148,9 @@ class Heads(Data):
 
 
 def halves(samples: Sequence[Labelled]) -> tuple[list[Labelled], list[Labelled]]:
-    """Return the two halves of the published test set, for validation and for the test.
+    """Return the first half of the published test set for validation, and the second half for the test.
 
-    The images of each half are chosen at random, as in the thesis authors' code.
+    The images are first shuffled at random, as in the thesis authors' code.
     """
     order = np.random.RandomState(SPLIT_SEED).choice(len(samples), len(samples), replace=False)
     shuffled = [samples[index] for index in order]
@@ -173,7 +174,7 @@ def load(
         reading: Settings for reading images.
         faults: Errors of labels that could not be read.
         generated_in: Cache folder of generated images; None for a user's images.
-        left_out: See `Labels`.
+        left_out: Clause about images that the labels themselves exclude, for the message about an empty split.
 
     Raises:
         DataError: An angle is not finite, a split is empty, or images cannot be read and are not to be skipped.

@@ -122,7 +122,7 @@ def _write_images(root: Path, side: int, name: str) -> None:
 def write_towncentre(root: Path) -> Path:
     """Write a folder of TownCentre heads with two images of each person, and return it.
 
-    The pan of person p is 10° p - 720° in the first image and 5° more in the second.
+    The pan of person number p is 10° · p - 720° in the first image and 5° more in the second.
     """
     for person in range(PEOPLE):
         folder = root / f"person{person}"

@@ -76,7 +76,7 @@ def read_label(file: Path) -> tuple[float, bool]:
     """Return the pan in degrees, and whether the head is marked as valid.
 
     Raises:
-        DataError: The file cannot be read, or has other lines than a label.
+        DataError: The file cannot be read, or is not a label file with the lines `pan` and `valid`.
     """
     with translate_errors(file, "a label"):
         text = decode(read_bytes(file))

@@ -27,8 +27,8 @@ class Anatomy:
     Attributes:
         place: position in the template: x to the left, y up, z to the front.
         arms, legs, head: share of the skinning weights that belongs to the joints of these parts.
-        along_arm, along_leg: distance from the shoulder, or from the hip, along the bones; below 0 before this joint
-            and on other parts of the body.
+        along_arm, along_leg: distance along the bones from the shoulder or from the hip; below 0 between the trunk and
+            this joint, and on other parts of the body.
         on_head: x in half widths of the head, y from 0 (under the chin) to 1 (crown), z from -1 (back) to 1 (nose).
         elbow, wrist, knee, ankle: positions of these joints along arm and leg.
         waist, hips, chest, neck: heights on the trunk.

@@ -107,7 +107,8 @@ def render_animation(
         frames: number of frames.
         start: time in the motion file at which the animation starts, s.
         azimuth: azimuth of the camera, degrees, if there is a motion file.
-        paths: files and folders that the run's configuration names, as in `framework.load`.
+        paths: files and folders by their keys in the run's configuration. A path that is stored in the run is used only
+            if it is repeated here.
     """
     description, _ = read_stored(run, paths=paths)
     data: HumanScans = training_data(description, "human_scans")

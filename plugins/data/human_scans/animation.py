@@ -113,7 +113,7 @@ def actor(registration: RegisteredMesh) -> Actor:
 
 
 def orbit(moments: Sequence[Moment], azimuths: Sequence[float], size: tuple[int, int]) -> list[Camera]:
-    """Return a camera for each azimuth, which looks at the middle of a person in all states.
+    """Return a camera for each azimuth; all of them look at the middle of the box around the person in all states.
 
     All cameras have the same distance from the middle: the smallest at which each camera shows the whole person in
     every state.
@@ -205,9 +205,9 @@ def columns(
 
 
 def side_by_side(pictures: Mapping[str, UInt8[np.ndarray, "height width 3"]], synthetic: bool) -> Image.Image:
-    """Return one image that shows all images in a row, with their names below.
+    """Return one image that shows the given images in a row, with their names below.
 
-    If the images are synthetic, the image has a note that says so.
+    If `synthetic` is true, a note in the returned image says that the images are synthetic.
     """
     height, width = next(iter(pictures.values())).shape[:2]
     sheet = Image.new("RGB", (width * len(pictures), height + CAPTION), "white")

@@ -82,7 +82,7 @@ class HumanScans(Data, SubjectFolder, HasScenes):
         variation: random changes of the training images.
 
     Raises:
-        DataError: a file is missing or damaged, or images differ in size, or meshes in their number of vertices.
+        DataError: a file is missing or damaged, images differ in size, or meshes differ in their number of vertices.
         ConfigError: the renderer draws no colours, or the topology is not generated.
     """
 
@@ -272,7 +272,7 @@ class Photographs(Dataset[Batch]):
 
     Args:
         subjects: subjects of the split.
-        shows: kind of the target, as in `HumanScans`.
+        shows: kind of the target, "photograph" or "subject" (the segmentation).
     """
 
     def __init__(self, subjects: Sequence[Subject], shows: Shows) -> None:

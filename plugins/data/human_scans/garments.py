@@ -45,8 +45,8 @@ class Skirt:
 
     Attributes:
         top, length: height of the skirt's upper border in the rest pose, and length of the skirt, metres.
-        flare: the radius of the skirt grows by at least flare - 0.08 per metre downwards; with a flare below 0.08 it
-            may shrink.
+        flare: the radius of the skirt grows by at least flare - 0.08 metres per metre downwards; with a flare below
+            0.08 the radius may shrink.
         pleats, depth: number of folds around the body, and about half of a fold's depth at the hem, metres.
         cloth: function from coordinates across and along the cloth to colours.
     """

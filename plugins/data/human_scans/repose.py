@@ -50,7 +50,7 @@ class Subject:
         fit: pose, shape and translation of the registration.
         offsets: displacements of the person's vertices from those of the fitted body model in the rest pose, metres.
         folded: number of vertices whose displacement cannot be determined along some direction
-            (framework.bodies.unposing); along this direction they stay near the vertices of the body model.
+            (framework.bodies.unposing); along this direction these vertices stay near those of the body model.
     """
 
     model: BodyModel
@@ -207,7 +207,8 @@ def main(arguments: list[str]) -> None:
     """Write `<name>_<pose>.ply` for each pose and shape, and cameras.json.
 
     Raises:
-        UserError: a mesh cannot be read, has no colours or is of another body; a pose or shape does not exist.
+        UserError: a mesh cannot be read, has no colours or is of another body; or a requested pose or shape does not
+            exist.
     """
     parser = argparse.ArgumentParser(
         prog="python -m plugins.data.human_scans.repose",

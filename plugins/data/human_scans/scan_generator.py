@@ -100,7 +100,8 @@ class Person(NamedTuple):
 class Crowd:
     """All generated people of a data set; a person depends only on the settings, the seed, the split and a number.
 
-    The arguments are those of `scans_root`.
+    The renderer draws the photographs. `counts` is the number of subjects of each split, by its name, `drawing` holds
+    the settings of people and photographs, and `seed` is the seed of all random draws.
     """
 
     def __init__(self, renderer: Renderer, counts: Mapping[str, int], drawing: Drawing, seed: int) -> None:

@@ -155,10 +155,10 @@ class ImageFolder(LabelledData):
 
 
 class TurnedImages(LabelledData):
-    """A user's own images, each turned by a random angle, which is the target; classes are groups of the results.
+    """A user's own images, each turned by a random angle, which is the target; results are also given for each class.
 
     An image is turned counter-clockwise about its centre, and only the largest disc inside the square is kept, since
-    the corners would reveal the angle. An image of the validation or test split is always turned by the same angle. A
+    the corners would reveal the angle. Each image of the validation or test split has one angle, which never changes. A
     training image is turned by a new angle in every epoch.
 
     Args:
@@ -205,7 +205,7 @@ class TurnedImages(LabelledData):
 
 
 class Turned(FetchedInBatches):
-    """Data set whose images are turned by their targets when they are fetched; without targets they are upright.
+    """Data set whose images are turned by their targets when they are fetched; images without targets stay upright.
 
     Args:
         upright: Data set of upright images.

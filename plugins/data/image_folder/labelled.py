@@ -39,10 +39,10 @@ class Listed(NamedTuple):
     """Labelled images before they are read into memory.
 
     Attributes:
-        names: Name of each image.
+        names: Name of each image: the path of its file relative to the folder, or a number in an idx file.
         labels: Name of the class of each image.
         splits: Split of each image; "" if it is to be chosen at random.
-        pixels: Images of idx files; None if `names` are files.
+        pixels: Images of idx files; None if `names` are paths of files.
         remarks: Clauses about files and columns that are not read.
     """
 
@@ -58,7 +58,8 @@ class Loaded(NamedTuple):
 
     Attributes:
         classes: Names of the classes.
-        splits: Name of each split with its data set, which has "input", "index" and the fields that `load` was given.
+        splits: Name of each split with its data set, which has "input", "index" and the fields that the argument
+            `make_fields` of `load` returned.
         skipped: Number of images that cannot be read.
         remarks: Clauses about files and columns that are not read.
         digest: Hash of names, classes, splits and, for idx files, pixels.
@@ -153,7 +154,7 @@ class LabelledImages:
 
         Args:
             root: Folder of the images.
-            make_fields: Function that returns the further fields of each split.
+            make_fields: Function that returns further fields of a split from the classes of its samples and its name.
             fewest: Smallest number of classes.
 
         Raises:

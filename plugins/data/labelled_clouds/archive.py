@@ -40,8 +40,8 @@ def read_archive(root: str | None) -> Archive:
     """Read and check the whole archive.
 
     Raises:
-        DataError: The root is not set or not an archive; an array is missing or of another shape; offsets do not rise;
-            a label has no class; or a coordinate is not finite. The message names the object.
+        DataError: The root is not set or not an archive; an array is missing or of another shape; the numbers in
+            `offset` do not rise; a label has no class; or a coordinate is not finite. The message names the object.
     """
     if root is None:
         raise DataError(

@@ -126,7 +126,7 @@ def load_listed(
         reading: Settings for turning files into clouds.
         cache_folder: Name of the cache folder that stores the clouds.
         unreadable: Treatment of files that cannot be read.
-        remedy: Advice in the message about such files.
+        remedy: Advice in the message about files that cannot be read.
 
     Raises:
         DataError: Some files cannot be read and are not to be skipped.
@@ -140,8 +140,8 @@ def load_listed(
 def describe_unread(listed: FileList, reading: Reading) -> tuple[str, ...]:
     """Return clauses for a message that say which parts of the user's files are not read.
 
-    They name the number of files of other kinds, and the columns of the first file that are not read. If the first file
-    is a mesh, a clause says that points are drawn from its faces.
+    The clauses name the number of files of other kinds, and the columns of the first file that are not read. If the
+    first file is a mesh, a clause says that points are drawn from its faces.
     """
     remarks = []
     if listed.ignored:

@@ -73,7 +73,7 @@ class Packed(NamedTuple):
 
     @classmethod
     def of(cls, clouds: Sequence[Float32[np.ndarray, "_points columns"]], columns: int) -> "Packed":
-        """Return the clouds, each with this number of columns, packed one after another."""
+        """Return the clouds packed one after another; each of them has `columns` columns."""
         table = np.concatenate([np.empty((0, columns), np.float32), *clouds])
         return cls(torch.from_numpy(table), torch.from_numpy(np.cumsum([0, *map(len, clouds)])))
 
@@ -91,7 +91,7 @@ class Loaded(NamedTuple):
 
 
 class Clouds(Dataset[dict[str, Tensor]]):
-    """Data set of some of the packed clouds, as "input" (points, columns), and of further fields.
+    """Data set with some of the packed clouds as "input", (points, columns), and with further fields.
 
     A batch is padded to its largest cloud with rows of NaN (`framework.geometry.clouds`).
 

@@ -76,7 +76,7 @@ def log_posterior(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[
 
 
 def posterior(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[np.ndarray, "*batch 2"]:
-    """Return p(y | x) for y = 0 and 1, the best possible prediction, of points in standard units.
+    """Return p(y | x) for y = 0 and 1, of points x in standard units; no prediction of the class y can be better.
 
     `noise` is the standard deviation of the noise, in radii.
     """

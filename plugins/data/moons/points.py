@@ -41,7 +41,7 @@ class Draws:
 
 
 class PlanePoints(Data):
-    """Base class of data sets of labelled points with independent draws in each split.
+    """Base class of data sets of labelled points in the plane, whose splits are drawn independently.
 
     A data set adds its constructor, its citation, `draw_split` and `fingerprint`.
     """

@@ -39,7 +39,7 @@ class Annotation:
         angles: Azimuth, elevation and tilt in degrees, not wrapped to one turn; None if the object has no fine label.
         truncated, occluded, difficult: Flags of the annotation.
         symmetry: Symmetry of a generated object (`Family.symmetry`); 1 for a real object.
-        blur: Blur of a generated image, pixels; None for a real image.
+        blur: Standard deviation of the blur of a generated image, pixels of the image; None for a real image.
     """
 
     file: Path

@@ -53,7 +53,8 @@ class AnnotatedObject(NamedTuple):
         box: First column, first row, last column and last row of the object, counted from 0.
         truncated, occluded, difficult: Flags of the annotation.
         fine: False if only a coarse label is given.
-        symmetry: See `Family`.
+        symmetry: n if the object looks the same after a rotation by 360°/n about the vertical; 0 if it does so after
+            any.
     """
 
     category: str
@@ -79,7 +80,7 @@ class Layer(NamedTuple):
 
 
 def camera_of(view: View) -> Camera:
-    """Return the camera of a view; its image has one pixel, and `crop_camera` gives it another size."""
+    """Return the camera of a view, with an image of one pixel; `crop_camera` returns a camera with a larger image."""
     angles = (math.radians(angle) for angle in (view.azimuth, view.elevation, view.tilt))
     camera = look_from(*angles, distance=view.distance, field_of_view=1.0, size=(1, 1))
     return dataclasses.replace(camera, focal=(view.focal, view.focal), principal=view.principal)
@@ -102,7 +103,7 @@ def crop_camera(camera: Camera, corner: tuple[int, int], size: tuple[int, int], 
 
 
 def projected_edges(mesh: Mesh, camera: Camera) -> Edges:
-    """Return the edges of the box around the projected vertices, pixels."""
+    """Return the left, top, right and bottom edge of the box around the projected vertices, pixels."""
     inside = camera.rotation.double().numpy() @ mesh.vertices.T + camera.translation.double().numpy()[:, None]
     column = camera.focal[0] * inside[0] / inside[2] + camera.principal[0]
     row = camera.focal[1] * inside[1] / inside[2] + camera.principal[1]

@@ -70,7 +70,7 @@ class PoseFromImage(Data):
     Args:
         renderer: draws the images.
         counts: numbers of images of the splits.
-        displacement: distance of the bodies from the nominal one.
+        displacement: settings of the difference between the drawn bodies and the nominal one.
         height, width: pixels, multiples of 4.
         body: file of a body model of the SMPL family (.npz, .pkl); None: the default body, extracted on first use.
         data_seed: seed of the draws, independent of the seed of the run.

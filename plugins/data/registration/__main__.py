@@ -48,7 +48,8 @@ def register(
 ) -> list[Path]:
     """Register a mesh to each scan and return the paths of the written files, two for each scan.
 
-    `paths` is the argument of the same name of `framework.load`.
+    `paths` holds files and folders by their keys in the model's configuration. A path that is stored in the checkpoint
+    is used only if it is repeated there.
     """
     predictor, description = load_with_description(checkpoint, paths=paths)
     data: Registration = training_data(description, "registration")

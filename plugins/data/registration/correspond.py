@@ -78,10 +78,15 @@ def main(arguments: list[str]) -> None:
 
 
 def model(checkpoint: str, paths: Mapping[str, str] | None = None) -> tuple[RegisterScan, Callable[[], Path]]:
-    """Return the registration function of a trained model, and a function that returns the root of generated people.
+    """Return a trained model's registration function, and a function that returns a folder of generated people.
 
-    The second function generates people of the model's body in FAUST's layout on its first call. `checkpoint` and
-    `paths` are the arguments of the same names of `framework.load`.
+    The registration function reads the file of a scan and returns the vertices of the registered mesh. The second
+    function generates people of the model's body in FAUST's layout on its first call.
+
+    Args:
+        checkpoint: run folder, checkpoint file or MLflow run id.
+        paths: files and folders by their keys in the model's configuration. A path that is stored in the checkpoint is
+            used only if it is repeated here.
 
     Raises:
         ConfigError: the checkpoint is of another data set.
@@ -115,7 +120,8 @@ def write_correspondences(
 
     For a vertex of the first scan, the nearest vertex of the mesh that is registered to the first scan is found. The
     vertex with the same number in the mesh that is registered to the second scan gives the position on the second scan
-    (thesis §6.5.2). `registered` is called once for each scan.
+    (thesis §6.5.2). `registered` registers a mesh to the file of a scan (`model`), and is called once for each scan.
+    `root` is the folder of FAUST.
 
     Raises:
         DataError: the challenge has no pairs, or a scan cannot be read.

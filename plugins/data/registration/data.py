@@ -122,13 +122,13 @@ class Registration(Bodies):
 class Faust(Bodies):
     """FAUST's training scans and their registrations, split by person (Bogo et al. 2014).
 
-    Inputs are points drawn from a scan's vertices, targets are the registration's vertices; "subject" (batch,) is the
-    person, 0 to 9. The scans of the test set have no registrations; they are for `mode=predict` and for
-    plugins.data.registration.correspond.
+    An input is a set of points drawn from a scan's vertices, and the target is the registration's vertices. The batch
+    field "subject" (batch,) is the number of the person, 0 to 9. The scans of FAUST's own test set have no
+    registrations; they are for `mode=predict` and for plugins.data.registration.correspond.
 
     Args:
         root: the folder that holds `training` (and `test`); None: people are generated in its layout.
-        body: body of generated people, see `Registration`.
+        body: file of the body model of generated people (.npz, .pkl); None: the default body.
         points: number of points of a cloud; scans have some 170,000.
         validation, test: people of these splits; all others are for training.
         data_seed: seed of the choice of points, independent of the seed of the run.

@@ -134,7 +134,7 @@ def read_registration(scan: Scan, vertices: int | None = None) -> tuple[np.ndarr
     """Return the vertices, metres, and the faces of a scan's registration.
 
     Raises:
-        DataError: the file cannot be read, or has another number of vertices than expected.
+        DataError: the file cannot be read, or does not have `vertices` vertices (None: any number).
     """
     mesh = read(scan.registration)
     if vertices not in (None, len(mesh.vertices)):

@@ -105,7 +105,8 @@ def render_panels(
 ) -> UInt8[np.ndarray, "2 4 height width 3"]:
     """Return orthographic views on white, y up, from the front and from the left.
 
-    The columns are the cloud alone, the mesh, both, and the cloud in its own colours.
+    The columns show the cloud alone, the mesh, both, and the cloud in the colours `colours`. The first index of the
+    result is the view, the second the column.
     """
     middle, reach = _frame(vertices, cloud)
     views = []

@@ -60,7 +60,7 @@ class SymmetricSolids(Data):
 
     Args:
         solids: names of the solids.
-        counts: number of images of each solid.
+        counts: number of images of each solid in each split.
         image_size: side of the images, pixels.
         label_noise_deg: standard deviation of N about each axis, degrees.
         data_seed: seed of the rotations and labels, independent of the seed of the run.

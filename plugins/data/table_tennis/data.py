@@ -56,7 +56,7 @@ class TableTennis(Data):
         grid: Settings of the frames that are read and predicted.
         validation: Share of the flights for validation, chosen at random.
         test: Share of the flights for the test, chosen at random.
-        data_seed: Seed of this choice, independent of the seed of the run.
+        data_seed: Seed of the choice of these flights, independent of the seed of the run.
         forget: Share of the observed frames that are hidden at random from each training window.
         unreadable: Treatment of files that cannot be read. "error" refuses them, "skip" leaves them out.
         times_in: Unit of the times in the files.

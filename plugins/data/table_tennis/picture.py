@@ -11,7 +11,7 @@ MARGIN = 8
 
 
 def side_view(frames: Float[np.ndarray, "frame 5"]) -> UInt8[np.ndarray, "height width 3"]:
-    """Return an image of the ball at each frame, seen from the side: y to the right and z up, in the same scale.
+    """Return an image of the ball at each frame, seen from the side: y to the right and z up, both in one scale.
 
     Early frames are pale, and the last frame is red.
     """

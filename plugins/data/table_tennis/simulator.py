@@ -83,7 +83,7 @@ def ensure_simulated(simulation: Simulation, constants: Constants, step: float) 
 def write(root: Path, simulation: Simulation, constants: Constants, step: float) -> None:
     """Write one CSV file per flight, with the observed t, x, y, z and the true positions true_x, true_y, true_z.
 
-    The arguments after `root` are those of `ensure_simulated`.
+    `constants` are those of the ball and the table, and `step` is the time from frame to frame, s.
     """
     seed = simulation.generator_seed
     starts = [draw_start(stream(seed, f"start {number}")) for number in range(simulation.flights)]

@@ -56,12 +56,12 @@ def flight(
     tolerance: float = 1e-8,
     most_steps: int = 20_000,
 ) -> Path:
-    """Return the flight from a state at `times[0]`, at all times.
+    """Return the flight that begins with the state `start` at `times[0]`, at all times.
 
     A flight is a sequence of phases, in each of which the derivative of the state is smooth: "air"; "pushed" (inside
     the table and pushed by it); "loose" (inside the table but not pushed); "rest" (at rest on the table); "below"
     (fallen beside the table). A phase ends at an event, which is located on the solver's dense output. Without a spring
-    a bounce takes no time (`bounce`), and bouncing ends at `REST`.
+    a bounce takes no time (`bounce`), and the ball comes to rest after a bounce with an upward speed of at most `REST`.
 
     Args:
         start: Position, velocity and spin at `times[0]`.

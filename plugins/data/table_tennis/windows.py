@@ -101,7 +101,7 @@ def interpolate(
     target_times: Float[np.ndarray, "time"],
     after: np.ndarray,
 ) -> Float[np.ndarray, "time 3"]:
-    """Return the positions at the target times, from the frames before and after each.
+    """Return the positions at the target times, interpolated between the frames before and after each of them.
 
     x and y are interpolated linearly; z follows the parabola of a free fall.
 

@@ -49,7 +49,7 @@ class Tabular(Data):
         columns: Columns of the input; None for every other column whose cells are mostly numbers.
         validation: Share of the rows for validation, chosen at random, if there is no column `split`.
         test: Share of the rows for the test, chosen at random, if there is no column `split`.
-        data_seed: Seed of this choice, independent of the seed of the run.
+        data_seed: Seed of the choice of these rows, independent of the seed of the run.
         missing: Treatment of rows without a number or a label. "error" refuses them, "skip" leaves them out.
         small_angles: Whether angles in degrees may all lie within ±2π; by default this is refused, because such angles
             look like radians.

@@ -29,7 +29,7 @@ def expand_words(cells: Columns, but: Collection[str]) -> tuple[Columns, Mapping
 
     Args:
         cells: The table.
-        but: Columns that are used for something else and stay as they are.
+        but: Names of columns that stay as they are, because they are used for something else.
     """
     reasons = numeric_columns(cells, but, "data.columns").left_out
     columns: dict[str, list[str]] = {}
@@ -47,7 +47,7 @@ def expand_words(cells: Columns, but: Collection[str]) -> tuple[Columns, Mapping
 
 
 def add_levels(cells: Columns, names: Sequence[str]) -> Columns:
-    """Return the table with added columns of the levels that a model reads, computed from its columns of words.
+    """Return the table with added columns of the levels that a model reads, computed from the table's words.
 
     A warning names levels in the table that the model does not know.
 

@@ -153,7 +153,8 @@ def load(
         writing: Notation of the file; None for the default.
         small_angles: Whether angles in degrees may all lie within ±2π.
         words: Treatment of columns of words.
-        arrange: Function that changes cells and settings after the table is read, for example adds a column `split`.
+        arrange: Function that changes cells and settings after the table is read; it may, for example, add a column
+            `split`.
 
     Raises:
         DataError: The file, a column, a cell, a label or a split has a fault; the message names line and column.
@@ -264,7 +265,7 @@ def from_memory(user_data: Any, columns: InputColumns) -> Float[Tensor, "row col
 
 
 class Standardise(nn.Module):
-    """Standardisation of rows, as `standardise` does it, for an exported model."""
+    """Standardisation of rows for an exported model: each number minus its column's mean, in standard deviations."""
 
     largest: Tensor
     mean: Tensor

@@ -22,14 +22,15 @@ class UCI(Tabular):
     """A table of the UCI repository with standard splits (Hernández-Lobato & Adams 2015).
 
     The file `<set>.csv` in the folder `root` has columns of numbers, the target in the column before the last, and a
-    last column `test_in_splits` with one character for each split. The rows that are not for the test are divided at
-    random into training and validation rows. Everything else is as in `tabular`.
+    last column `test_in_splits` with one character for each split, T if the row is a test row of this split. The rows
+    that are not for the test are divided at random into training and validation rows. Inputs are standardised, and
+    targets keep their own unit (`Tabular`).
 
     Args:
         root: The folder of the files.
         set: Name of the file, without its ending.
         split: Number of the split, from 0.
-        validation: Share of the rows that are not for the test, for validation.
+        validation: Share of the rows for validation, among those that are not for the test.
         data_seed: Seed of the choice of the validation rows.
     """
 

@@ -1,12 +1,12 @@
 """Fit of a body to an image by gradient descent through a differentiable renderer, from coarse to fine.
 
 The loss is the squared difference of two images, colours and silhouette, plus a weak prior on the pose. The images are
-drawn at a fraction of the size and blurred, so that edges that are far apart also have a gradient. A stage is a descent
-at one size and one blur (`Stage`); the stages follow each other with growing size and less blur. The gradient is the
-renderer's. Steps are quasi-Newton (BFGS with Powell's damping; Nocedal & Wright 2006, procedure 18.2). The Hessian
-approximation starts from the optical flow of the rendered image: the change of a pixel is its gradient along rows and
-columns times the motion of the surface there (Lucas & Kanade 1981). The body model gives the derivatives of that motion
-in closed form.
+drawn at a fraction of the size and blurred, so that the loss has a gradient even if the edges of the two images are far
+apart. A stage is a descent at one size and one blur (`Stage`); the stages follow each other with growing size and less
+blur. The renderer gives the gradient of the rendered image. Steps are quasi-Newton (BFGS with Powell's damping; Nocedal
+& Wright 2006, procedure 18.2). The Hessian approximation starts from the optical flow of the rendered image: the change
+of a pixel is its gradient along rows and columns times the motion of the surface there (Lucas & Kanade 1981). The body
+model gives the derivatives of that motion in closed form.
 """
 
 import time
@@ -75,10 +75,11 @@ class Descent:
 
     Args:
         body_model: body that the images show.
-        renderer: differentiable renderer that draws it.
+        renderer: differentiable renderer that draws the body.
         camera: camera of the images.
         steps: largest number of steps of a stage.
-        restarts: largest number of restarts from other poses while the images differ by more than `enough`.
+        restarts: largest number of restarts from other poses while the rendered and the given image differ by more than
+            `enough`.
         enough: root mean square difference of colours at which no restart is needed.
     """
 

@@ -45,8 +45,9 @@ class FitPoseHead(DensityHead, Fitted):
     Args:
         renderer: differentiable renderer that draws the body for the comparison with the image.
         steps: largest number of steps of a stage; there are seven stages.
-        restarts: largest number of restarts from other poses while the images differ by more than `enough`.
-        enough: root mean square difference of colours below which images agree.
+        restarts: largest number of restarts from other poses while the rendered and the given image differ by more than
+            `enough`.
+        enough: root mean square difference of colours below which the rendered and the given image agree.
         height, width, body: the same values as in the config of the data.
 
     Raises:

@@ -66,7 +66,7 @@ class BallisticHead(DensityHead, Fitted):
         density: method by which the state's uncertainty is propagated.
         samples: number of sampled flights in the mixture; may be set at any time.
         spin: prior standard deviation of each component of the spin, rad/s.
-        noise: standard deviation of a coordinate, m; initial value of `fit`.
+        noise: standard deviation of the measurement error of each coordinate, m; initial value of `fit`.
         steps: largest number of steps of the search for a state; real flights take about ten.
         identify: whether `fit` identifies the constants; otherwise the constants of the config are used.
         constants: constants of the ball and the table; initial values of `fit`.
@@ -180,7 +180,10 @@ class BallisticHead(DensityHead, Fitted):
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Fit a factor of each number's standard deviation, so that its variance equals the mean squared residual."""
+        """Fit a factor of the standard deviation of each number.
+
+        With many samples, the variance of a number then equals its mean squared residual.
+        """
         self.spread.fill_(1.0)
         observations = observed_frames(raw.unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
         estimate = estimate_states(

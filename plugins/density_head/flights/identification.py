@@ -76,8 +76,8 @@ def identify(
         observations: frames of whole flights: the frames that a model reads, and those that it predicts.
         initial: constants from which the search starts.
         states: states at the first frames, from which the search starts.
-        noise: standard deviation of each coordinate, m.
-        prior: prior of the states.
+        noise: standard deviation of the measurement error of each coordinate, m.
+        prior: prior density of the states at the first frames.
     """
     numbers = fitted_constants(initial)
     middle = torch.tensor([0.0, 0.0, 0.0, 0.0, initial.surface], dtype=torch.float64)

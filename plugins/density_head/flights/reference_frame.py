@@ -31,9 +31,10 @@ OUTSIDE = 0.2
 
 
 def accelerations(observations: ObservedFrames) -> Float[Tensor, "piece 3"]:
-    """Return the acceleration of the parabola that fits each piece of the flights best, m/s².
+    """Return the acceleration of the parabola that fits each piece of PIECE consecutive frames best, m/s².
 
-    Most pieces are too short for a bounce. Pieces in which many frames are missing are left out.
+    Consecutive pieces of a flight overlap by half. Most pieces are too short to hold a bounce. Pieces in which many
+    frames are missing are left out.
     """
     length = min(PIECE, observations.times.shape[1])
     times = observations.times.unfold(1, length, length // 2).flatten(0, 1)
@@ -70,8 +71,8 @@ def bounces(observations: ObservedFrames) -> Float[Tensor, "bounce 3"]:
 def require_frame(observations: ObservedFrames, constants: Constants, by: str) -> Constants:
     """Return the constants, with the height of the table at which the flights bounce.
 
-    Nothing is concluded from fewer than five pieces of flights or five bounces, from flights that are not those of a
-    falling ball, or from bounces at different heights.
+    Nothing is concluded from fewer than five pieces of flights (PIECE frames each) or five bounces, from flights that
+    are not those of a falling ball, or from bounces at different heights.
 
     Args:
         observations: whole flights.

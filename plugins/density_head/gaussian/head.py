@@ -31,7 +31,8 @@ class GaussianHead(HeadOfReals):
     With `scale="predicted"` each input has its own standard deviations, trained by likelihood (eq. 2.8). With "fixed"
     it trains by squared error, which is likelihood with σ = 1, and `calibrate` fits one covariance to the validation
     residuals by maximum likelihood. If `Target` has the mean and the standard deviations of the training targets, raw
-    parameters are relative to them; the density is then in the target's own unit and in double precision.
+    parameters describe the target minus this mean, in these standard deviations. The density is then in the target's
+    own unit and in double precision.
 
     Args:
         scale: source of the standard deviations.
@@ -149,7 +150,7 @@ def fit(
 ) -> tuple[Float[Tensor, "number"], Float[Tensor, "number number"]]:
     """Return the maximum-likelihood scales σ and coefficients φ of `Gaussian` for residuals of mean 0.
 
-    They come from a least-squares regression of each number on the numbers before it.
+    Both come from a least-squares regression of each number on the numbers before it.
     """
     count = residual.shape[-1]
     scale, coefficients = residual.new_zeros(count), residual.new_zeros(count, count)

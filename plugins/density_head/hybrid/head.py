@@ -26,10 +26,10 @@ class HybridHead(DensityHead):
     each number of the target: the logarithm of the unit in which the component describes the distance of the target
     from the mean. A network of two hidden layers reads all features and predicts the raw parameters of the component.
     Unless the component has trained parameters of its own, the last layer of the network starts at 0, so that at first
-    the mean is the encoder's mean.
+    the mean of the density is the encoder's mean.
 
     Args:
-        further: number of features of the encoder beside the mean and the units.
+        further: number of the encoder's features that follow the mean and the logarithms of the units.
         hidden: width of the network.
         share: factor by which the encoder's units are multiplied to give the units of the component.
         component: the head whose density is shifted and scaled.

@@ -38,13 +38,13 @@ class ImplicitPDFHead(DensityHead):
     the standard deviation of the true density about an axis. The cost is then about h²/(24 σ²) nats for each of the
     three axes: 0.02 nats for 36,864 cells (h = 7.5°) and σ = 10°.
 
-    The loss compares f at the label with f at the centres of `training_cells` cells, in a random rotation A that the
-    samples of a batch share:
+    The loss compares f at the label R with f at the centres Rᵢ of n = `training_cells` cells. The centres are rotated
+    by a random rotation A, which the samples of a batch share. With the elevation e of the label, the loss is
 
-        -f(x, R) + log((exp f(x, R) + Σ exp f(x, Rᵢ A)) / (n + 1)) - log(cos e / 8π²).
+        -f(x, R) + log((exp f(x, R) + Σᵢ exp f(x, Rᵢ A)) / (n + 1)) - log(cos e / 8π²).
 
-    Murphy et al. turn the grid so that it contains the label; here the label is added to the grid. f then learns the
-    log-density up to a constant that may depend on x.
+    Murphy et al. rotate the centres so that one of them is the label; here the label is added to the centres. f then
+    learns the log-density up to a constant that may depend on x.
 
     Args:
         hidden: width of the layers.

@@ -95,9 +95,10 @@ class Networks(Latent):
         return torch.cat([self.decode(part) for part in z.split(self.at_once(len(z)))]).movedim(0, -2)
 
     def log_weights(self, value: Tensor, items: Tensor, noise: Tensor) -> Tensor:
-        """Return the log of the importance weights of z that are drawn from q(z|x,φ), nats (eq. 3.19).
+        """Return the log of the importance weights of z that are drawn from q(z|x,φ), nats (thesis eq. 3.19).
 
-        Arguments and shapes are those of `Latent.log_weights`.
+        `value` are targets φ, (row, *event), and `items` the index of each row's item in the flattened batch. `noise`
+        holds the standard normal numbers from which z is computed, (*draw, row, latent).
         """
         return importance_log_weights(self.rows(items), value, noise)
 
@@ -111,7 +112,7 @@ class Networks(Latent):
         return torch.cat(parts)
 
     def tempered(self, temperature: Tensor) -> "Networks":
-        """Return a copy whose components are tempered (`protocol.tempered_density`)."""
+        """Return a copy with each component p replaced by p^(1/T), normalised, where T > 0 is `temperature`."""
         return replace(
             self,
             component=lambda raw: tempered_density(self.component(raw), temperature),
@@ -120,7 +121,7 @@ class Networks(Latent):
 
 
 def importance_log_weights(networks: Networks, value: Tensor, noise: Tensor) -> Tensor:
-    """Return log p(φ|x,z) p(z|x) / q(z|x,φ), nats, for φ in `value` and z drawn from q (terms of eq. 3.19).
+    """Return log p(φ|x,z) p(z|x) / q(z|x,φ), nats, for φ in `value` and z drawn from q (thesis eq. 3.19).
 
     `noise` holds the standard normal numbers from which z is computed. The shapes are (*sample, *batch, *event) for
     `value`, (*draw, *sample, *batch, latent) for `noise`, and (*draw, *sample, *batch) for the result.
@@ -132,7 +133,7 @@ def importance_log_weights(networks: Networks, value: Tensor, noise: Tensor) -> 
 
 
 def evidence_bound(networks: Networks, value: Tensor, samples: int) -> Tensor:
-    """Return a lower bound on log p(φ|x) for φ in `value`, nats, (*batch,) (eq. 3.17).
+    """Return a lower bound on log p(φ|x) for φ in `value`, nats, (*batch,) (thesis eq. 3.17).
 
     It is the expectation of log p(φ|x,z) under q(z|x,φ), estimated by `samples` samples of z, minus the exact
     divergence of q(z|x,φ) from the prior.
@@ -204,7 +205,7 @@ class CVAEHead(DensityHead):
         return LatentDensity(self.networks(raw), effort)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return the negative evidence lower bound of each sample, nats (eq. 3.18)."""
+        """Return the negative evidence lower bound of each sample, nats (thesis eq. 3.18)."""
         return -evidence_bound(self.networks(raw), target, self.training_samples)
 
     def networks(self, raw: Float[Tensor, "*batch size"]) -> Networks:

@@ -77,7 +77,7 @@ class Latent(ABC):
     def numbers(self, noise: Float[Tensor, "sample item latent"]) -> Float[Tensor, "*batch sample number"]:
         """Return the component's raw parameters at the z that belong to `noise`.
 
-        They are computed in chunks if no gradient is needed.
+        The parameters are computed in chunks if no gradient is needed.
         """
 
     @abstractmethod
@@ -98,7 +98,7 @@ class Latent(ABC):
 
     @abstractmethod
     def tempered(self, temperature: Tensor) -> "Latent":
-        """Return a copy whose components are tempered (`protocol.tempered_density`)."""
+        """Return a copy with each component p replaced by p^(1/T), normalised, where T > 0 is `temperature`."""
 
     @property
     def items(self) -> int:
@@ -115,8 +115,8 @@ class Latent(ABC):
         """Return the sequences of standard normal points for all items (`NormalPoints`).
 
         Args:
-            effort: number of samples, which determines the number of replicates.
-            kept_count: number of points of each replicate that stay in memory, as in `NormalPoints`.
+            effort: number of samples, which determines the number of replicates (independent parts of the samples).
+            kept_count: number of points at the start of each replicate that stay in memory after their first use.
         """
         dtype, device = self.center.dtype, self.center.device
         dimensions = self.center.shape[-1]
@@ -132,12 +132,12 @@ class Latent(ABC):
 
 
 def sampled_mixture(latent: Latent, points: NormalPoints, effort: Effort) -> SampledMixture:
-    """Return the mixture, with equal weights, of the components at S points z (eq. 3.21).
+    """Return the mixture, with equal weights, of the components at S points z (thesis eq. 3.21).
 
     Args:
         latent: networks of the head, applied to a batch of inputs x.
         points: sequences of standard normal points, of which the first ones are used.
-        effort: number S of points, and number of replicates.
+        effort: number S of points, and number of replicates (independent parts of the points).
     """
     items = torch.arange(latent.items, device=latent.center.device)
     number = latent.numbers(points(items, 0, effort.first).flatten(0, 1))
@@ -146,7 +146,7 @@ def sampled_mixture(latent: Latent, points: NormalPoints, effort: Effort) -> Sam
 
 
 class LatentDensity(PlainDensity):
-    """The density p(φ|x) = ∫ p(φ|x,z) p(z|x) dz (eq. 3.12, 3.21).
+    """The density p(φ|x) = ∫ p(φ|x,z) p(z|x) dz (thesis eq. 3.12, 3.21).
 
     `log_prob` is the logarithm of the mean of importance weights at random values of z. These values are sampled once,
     so that log_prob is a fixed function of φ. Its expectation over the values of z is below the true log-density and

@@ -148,15 +148,15 @@ def estimate_from_sums(
     over replicates removes the same term, but is infinite if one replicate has all the weight; s² is at most 1, and
     the correction at most 1/2.
 
-    The shares of points (`stretch`) have the expectation 1. If they are given, the estimate is the ratio of the mean
-    weight to the mean share, which has no error if the weights are proportional to the shares. The 1 in s² is then
-    replaced by the mean share of replicate r divided by the mean share of all replicates (ratio estimator, Cochran
-    1977, §6).
+    The share of a point is its standard normal density divided by the density from which it was drawn (`stretch`), and
+    has the expectation 1. If shares are given, the estimate is the ratio of the mean weight to the mean share, which
+    has no error if the weights are proportional to the shares. The 1 in s² is then replaced by the mean share of
+    replicate r divided by the mean share of all replicates (ratio estimator, Cochran 1977, §6).
 
     Args:
         log_sums: log of the sum of the weights of each replicate.
         count: number of weights of each replicate.
-        log_shares: log of the sum of the shares of each replicate (`stretch`), or None.
+        log_shares: log of the sum of the shares of each replicate; None if the points are standard normal.
     """
     replicates = len(log_sums)
     log_count = math.log(replicates * count) if log_shares is None else torch.logsumexp(log_shares, 0)
@@ -199,7 +199,9 @@ def estimate_log_mean(
     Args:
         log_weights: function of (items (n,) int64, start, count) that returns (replicate, count, n): the log of the
             weights of these items at the points `start` to `start + count` of each replicate, nats, -inf for a weight
-            of 0. It may return (2, replicate, count, n) instead: the logs of weights and shares (`stretch`).
+            of 0. It may return (2, replicate, count, n) instead: first the logs of the weights, each multiplied by the
+            share of its point, then the logs of these shares. The share of a point is its standard normal density
+            divided by the density from which it was drawn (`stretch`).
         items: number of items.
         effort: number of samples, and tolerance.
         at_once: largest number of weights requested together (at least one for each replicate).

@@ -50,9 +50,10 @@ class Networks(Latent):
         return torch.cat([self.decode(raw, part) for part in z.split(self.at_once(z.shape[-2]), -2)], -2)
 
     def log_weights(self, value: Tensor, items: Tensor, noise: Tensor) -> Tensor:
-        """Return the component's log-density at each z, nats (eq. 3.21).
+        """Return the component's log-density at each z, nats (thesis eq. 3.21).
 
-        Arguments and shapes are those of `Latent.log_weights`.
+        `value` are targets φ, (row, *event), and `items` the index of each row's item in the flattened batch. `noise`
+        holds the values of z, (*draw, row, latent).
         """
         raw = self.raw.reshape(-1, self.raw.shape[-1])[items]
         return self.component(self.decode(raw, noise)).log_prob(value)
@@ -64,7 +65,7 @@ class Networks(Latent):
         return self.component(self._decoded(z)).sample().movedim(like.dim() - 1, 0)
 
     def tempered(self, temperature: Tensor) -> "Networks":
-        """Return a copy whose components are tempered (`protocol.tempered_density`)."""
+        """Return a copy with each component p replaced by p^(1/T), normalised, where T > 0 is `temperature`."""
         return replace(self, component=lambda raw: tempered_density(self.component(raw), temperature))
 
 

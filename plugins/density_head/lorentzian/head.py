@@ -31,7 +31,7 @@ class LorentzianHead(DensityHead, Fitted):
 
     Args:
         steps: initial value of the attribute.
-        offsets: frequency offsets of the data, ppm.
+        offsets: frequency offsets of the data, ppm; None for `framework.spectra.offsets.OFFSETS`.
 
     Raises:
         ConfigError: no preset has this target.

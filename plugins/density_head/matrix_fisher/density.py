@@ -27,7 +27,7 @@ class MatrixFisher(MatrixDensity):
     their log-density at data in the chart is lower by up to log 2.
 
     At the poles the density is 0 with respect to da de dt. No floating-point number is exactly π/2, so that log_prob
-    and its gradients stay finite there.
+    and its gradients stay finite at the poles.
 
     Args:
         parameter: F, (*batch, 3, 3); 0 is the uniform density of rotations.

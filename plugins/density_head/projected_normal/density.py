@@ -27,7 +27,7 @@ class ProjectedNormal(PlainDensity):
 
     Args:
         mean: μ, (*batch, angle, 2).
-        factor: s and t of P = LLᵀ (`functions`), (*batch, angle, 2).
+        factor: s and t of P = LLᵀ with L = [[exp(s), 0], [t, exp(-s)]], (*batch, angle, 2).
         dtype: dtype of all results; by default that of `mean`. All computations are in float64.
     """
 

@@ -27,8 +27,8 @@ def log_prob(
 
     Args:
         angle: θ, radians.
-        mean: μ.
-        factor: s and t.
+        mean: μ, the mean of the normal vector.
+        factor: s and t of the Cholesky factor [[exp(s), 0], [t, exp(-s)]] of P.
     """
     cosine, sine = torch.cos(angle), torch.sin(angle)
     grow, shear = factor.unbind(-1)

@@ -84,7 +84,7 @@ class QuantilesHead(DensityHead):
         return PiecewiseQuantiles(location, steps * unit, self.levels, self.tail)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return twice the mean pinball loss of each sample, before the corrections that `calibrate` finds."""
+        """Return twice the mean pinball loss of each sample, for quantiles that `calibrate` has not moved."""
         quantiles = PiecewiseQuantiles(*self._parts(raw), self.levels, self.tail).quantiles
         gap = self.unit.standardise(target).to(quantiles) - quantiles
         levels = self.levels.to(quantiles)
@@ -92,7 +92,7 @@ class QuantilesHead(DensityHead):
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Set the corrections of all quantiles.
+        """Set the distance by which each quantile is moved, as a share of the range of all quantiles.
 
         Of n samples, at least min(n, ⌈(n + 1) τ⌉) lie at or below the moved quantile of the probability τ.
         """

@@ -18,9 +18,10 @@ DRAWS = 2000
 class RotationLaplace(MatrixDensity):
     """Azimuth a, elevation e and tilt t of a rotation R with density exp(-d)/d up to a constant, d² = tr(S - AᵀR) + δ².
 
+    A = U S Vᵀ is the proper singular value decomposition, and δ = `SOFTENING` makes the density finite at the mode.
     Near the mode, d is proportional to the angle from it, so that log p falls linearly and not quadratically. log_prob
-    is with respect to da de dt in the chart -π/2 ≤ e ≤ π/2, log p(R) + log(cos e / 8π²). An elevation outside the
-    chart is read as the viewpoint of the same rotation inside.
+    is with respect to da de dt in the chart -π/2 ≤ e ≤ π/2, log p(R) + log(cos e / 8π²). An elevation outside the chart
+    is read as the viewpoint of the same rotation inside.
 
     Args:
         parameter: A, (*batch, 3, 3); 0 is the uniform density of rotations.

@@ -64,7 +64,7 @@ def log_node_weights(falls: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor]:
     """Return the nodes s of the integral for the normaliser F(A), and the logarithms of their terms.
 
     Args:
-        falls: λ, as in the module's docstring.
+        falls: λ, the rates at which the log-density falls along the components of the aligned quaternion, ascending.
 
     Returns:
         s, (node,), and the logarithm of the term of each node in the sum for F(A), (*batch, node).

@@ -31,7 +31,7 @@ class EvidentialHead(HeadOfReals):
 
     For each number, the head reads four raw parameters. The first is γ itself. ν, α - 1 and √β are the positive
     function `scale_of_raw` of the other three. If `Target` has the mean and the standard deviations of the training
-    targets, raw parameters are relative to them.
+    targets, raw parameters describe the target minus this mean, in these standard deviations.
 
     Args:
         evidence_weight: λ. The likelihood depends on ν and β only through one number, so that the penalty alone
@@ -59,7 +59,11 @@ class EvidentialHead(HeadOfReals):
         return StudentT(location, scale, density.freedom.to(location))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return the negative log-likelihood of each sample, nats; its gradient includes the penalty's gradient."""
+        """Return the negative log-likelihood of each sample, nats.
+
+        The value does not contain the penalty of the class. The gradient is that of the negative log-likelihood plus
+        the penalty.
+        """
         location, nu, alpha, root_beta = self.evidence(raw)
         value = self.unit.standardise(target).to(location)
         losses = -self._density(location, nu, alpha, root_beta).each_log_prob(value)

@@ -35,11 +35,12 @@ therefore stays near 1 and the density near a normal one.
 class StudentTHead(HeadOfReals):
     """Student's t over one or more independent reals, with a location and a scale for each input.
 
-    Its tails fall with a power, so that a target far from the location costs a few nats where a Gaussian costs
-    hundreds. With `degrees_of_freedom="calibrated"` the head trains as a Gaussian, and `calibrate` then chooses a
-    factor on all scales and the degrees of freedom by their likelihood. If `Target` has the mean and the standard
-    deviations of the training targets, raw parameters are relative to them; the density is then in the target's own
-    unit and in double precision.
+    The tails of the density fall with a power. A target far from the location therefore has a loss of a few nats, where
+    the loss of a Gaussian is hundreds of nats. With `degrees_of_freedom="calibrated"` the head trains as a Gaussian,
+    and `calibrate` then chooses, by their likelihood, the degrees of freedom and a factor by which all scales are
+    multiplied. If `Target` has the mean and the standard deviations of the training targets, raw parameters describe
+    the target minus this mean, in these standard deviations. The density is then in the target's own unit and in double
+    precision.
 
     Args:
         degrees_of_freedom: "calibrated": `calibrate` chooses one value for each number of the target. "predicted": the
@@ -87,8 +88,8 @@ class StudentTHead(HeadOfReals):
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
         """Return the negative log-likelihood of each sample, nats.
 
-        With `degrees_of_freedom="calibrated"` it is that of a normal density, without the factor that `calibrate` sets.
-        `balance` changes its gradient, not its value.
+        With `degrees_of_freedom="calibrated"` the density is normal, and its scales are not multiplied by the factor
+        that `calibrate` sets. `balance` changes the gradient of the loss, not its value.
         """
         location, scale, freedom = self._parts(raw)
         value = self.unit.standardise(target).to(location)
@@ -103,9 +104,9 @@ class StudentTHead(HeadOfReals):
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Choose the factor on the scales and the degrees of freedom of each number by their likelihood.
+        """Choose the degrees of freedom of each number and the factor of its scales, by their likelihood.
 
-        Both are chosen from a grid that holds the state before calibration, so that the likelihood does not fall.
+        Both are chosen from a grid that holds their values before calibration, so that the likelihood does not fall.
         """
         if not self.calibrated:
             return

@@ -35,10 +35,10 @@ def leaves(samples, feature, threshold, branch, root):
 
     Args:
         samples: (sample, feature) float32.
-        feature: see the module.
-        threshold: see the module.
-        branch: see the module.
-        root: see the module.
+        feature: (node,) int32, the feature that a node compares; -1 at a leaf.
+        threshold: (node,) float32; samples whose feature is at most the threshold go left.
+        branch: (node, 2) int32, the left and the right child of a node; at a leaf, the number of the leaf, twice.
+        root: (tree,) int32, the root node of each tree.
     """
     leaf = np.empty((len(root), len(samples)), np.int32)
     for tree in range(len(root)):

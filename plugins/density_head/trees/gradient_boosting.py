@@ -41,7 +41,7 @@ class XGBoostHead(DensityHead, Fitted):
     the fit, and on the validation split after `calibrate`. The output of the trees is piecewise constant in the
     features, and its gradient is 0. Predictions are float32.
 
-    The model is stored as bytes in the library's own portable binary format (UBJSON), which contains no code.
+    The model is stored as bytes in XGBoost's own portable binary format (UBJSON), which contains no code.
 
     Attributes:
         rounds: number of boosting rounds whose trees are used, counted from the first (a knob).

@@ -1,4 +1,4 @@
-"""Functions that grow a forest with scikit-learn and store it in flat arrays; a stored forest is used without them."""
+"""Functions that grow a forest with scikit-learn and store it in flat arrays, which are used without scikit-learn."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -30,7 +30,8 @@ def grow_forest(
         target: (sample,) labels below `classes`; or (sample, number) float64 if `classes` is 0.
         classes: number of classes; 0 for reals.
         trees: number of trees.
-        share: share of the features tried at each split; None for the default of the head.
+        share: share of the features tried at each split; None for the square root of their number if the target is a
+            class, and for all features otherwise.
         leaf: smallest number of training samples of a leaf.
         depth: largest number of splits from root to leaf; None for no limit.
         seed: seed of the forest.

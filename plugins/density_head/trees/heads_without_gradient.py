@@ -1,4 +1,4 @@
-"""Functions shared by the heads of trees (framework.density_head.Fitted): checks, inputs, and loading of states."""
+"""Functions that both heads of trees share: checks, conversion of inputs, gradients of 0, and loading of states."""
 
 from collections.abc import Callable, Mapping
 from functools import partial

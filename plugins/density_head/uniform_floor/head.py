@@ -21,7 +21,7 @@ COMPONENT = {"name": "von_mises"}
 class UniformFloorHead(DensityHead):
     """A component's density p with a uniform floor u, (1 - γ) p + γ u, so that no target is impossible.
 
-    No loss exceeds log(1/(γu)). The original code of the method in thesis §3 silently adds such a floor to its
+    No loss exceeds log(1/(γu)). The original code of the method of thesis Chapter 3 silently adds such a floor to its
     mixtures. Here the floor is a head of its own, so that it appears in the config, in the run's parameters and in the
     name of the method. With γ = 0 the head equals its component.
 

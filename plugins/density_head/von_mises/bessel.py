@@ -28,7 +28,8 @@ def log_height(concentration: Tensor) -> Tensor:
 def height_and_deviation(concentration: Tensor) -> tuple[Tensor, Tensor]:
     """Return the log-density at the mean, as `log_height`, and its derivative in κ, 1 - A(κ), in one pass.
 
-    With v = 2/(κ+2) and the polynomial G(v) of the function "log_peak", the derivative is v (1/4 + v G'(v)/2).
+    With v = 2/(κ+2) and the polynomial G(v) that approximates log(2π I0(κ) exp(-κ)) + log(κ+2)/2 ("log_peak"), the
+    derivative is v (1/4 + v G'(v)/2).
     """
     v = 2 / (concentration + 2)
     rows, piece, y, by_v = _locate("log_peak", v)

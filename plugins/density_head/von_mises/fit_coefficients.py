@@ -2,8 +2,8 @@
 
 Every function below is smooth on κ ∈ [0, ∞] as a function of v = 2/(κ+2) ∈ [0, 1]. That interval is divided into equal
 pieces, whose number is a power of two, so that v's piece and its position y ∈ [-1, 1] there are found without rounding.
-On each piece the function is interpolated at Chebyshev nodes in 60 digits and written as a polynomial in y. The
-tolerance also holds for the polynomial's first derivative in v, from which 1 - A(κ) is computed.
+On each piece the function is interpolated at Chebyshev nodes in 60 digits and written as a polynomial in y. The errors
+of the polynomial and of its first derivative in v, from which 1 - A(κ) is computed, stay within a tolerance.
 """
 
 from functools import cache
@@ -140,7 +140,7 @@ def table(dtype: str, which: int) -> list[tuple[float, ...]]:
 
 
 def chain(which: int) -> list[tuple[float, ...]]:
-    """Return the coefficients of function number `which` on the pieces between BORDERS, (power, piece).
+    """Return the coefficients of function number `which` on the pieces of v between BORDERS, (power, piece).
 
     All pieces have the largest degree that any of them needs.
     """

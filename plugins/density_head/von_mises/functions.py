@@ -69,7 +69,7 @@ def mean_resultant_slope(concentration: Tensor) -> Tensor:
 
 @torch.no_grad()
 def concentration_of_moments(resultant: Tensor, deviation: Tensor) -> Tensor:
-    """Return κ with A(κ) = resultant: the maximum-likelihood κ of angles around a known mean (eq. 3.5), float64.
+    """Return κ with A(κ) = resultant: the maximum-likelihood κ for a known mean (thesis eq. 3.5), float64.
 
     Args:
         resultant: R, the mean of cos(φ-μ); below 0 the result is κ = 0.

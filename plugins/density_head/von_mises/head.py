@@ -97,7 +97,7 @@ class VonMisesHead(DensityHead):
 def polar(
     cosine: Float[Tensor, "*shape"], sine: Float[Tensor, "*shape"]
 ) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
-    """Return the angle, radians, and the length of the vector (cosine, sine) (eq. 3.1).
+    """Return the angle, radians, and the length of the vector (cosine, sine) (thesis eq. 3.1).
 
     Gradients are finite for every vector, also for the zero vector.
     """

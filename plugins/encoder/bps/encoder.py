@@ -41,7 +41,7 @@ class BPS(Encoder):
         features: names of the features of each basis point, in order: "distance" (1 number, eq. 6.4), "delta" (3
             numbers, eq. 6.5), and attributes of the nearest point: "color" (3 numbers: red, green, blue), "normal" (3
             numbers), or the name of a column (1 number).
-        normalise: as in `framework.geometry.clouds.normalise_clouds`.
+        normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`).
         basis_seed: seed of "ball_uniform"; the run's seed has no influence.
         rotation_invariant: encode each cloud along its own axes (`plugins.encoder.bps.frame`).
 

@@ -103,24 +103,25 @@ def encode(
 ) -> Encoding:
     """Return, for each basis point, the requested features of the nearest point of each cloud.
 
-    "distance" is the distance of the nearest point from the basis point (eq. 6.4). "delta" is the vector from the basis
-    point to the nearest point (eq. 6.5). "color", "normal" or the name of a column are attributes of the nearest point,
-    unchanged ("x", "y", "z" are normalised). Distances and deltas are in units of the normalised cloud. All features
-    have the basis's dtype. They are differentiable in the clouds, except where another point becomes the nearest.
+    "distance" is the distance of the nearest point from the basis point (thesis eq. 6.4). "delta" is the vector from
+    the basis point to the nearest point (eq. 6.5). "color", "normal" or the name of a column are attributes of the
+    nearest point, unchanged ("x", "y", "z" are normalised). Distances and deltas are in units of the normalised cloud.
+    All features have the basis's dtype. They are differentiable in the clouds, except where another point becomes the
+    nearest.
 
     Args:
         clouds: (batch, points, columns), padded as `framework.geometry.clouds` describes.
         basis: basis points, as `prepare_basis` returns them.
         features: names of the features, in the order of the result.
-        normalise: as in `framework.geometry.clouds.normalise_clouds`.
+        normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`).
         columns: names of the clouds' columns, if a feature is an attribute.
         rotation_invariant: whether to encode each cloud in its own frame (`plugins.encoder.bps.frame`); normals are
             rotated into this frame too.
 
     Raises:
         ConfigError: a feature needs a column that the clouds do not have.
-        DataError: as `framework.geometry.clouds.sizes`; or `normalise` is "none" and the clouds are clearly not
-            normalised.
+        DataError: a cloud has no points, or a number of a point is not finite; or `normalise` is "none" and the clouds
+            are clearly not normalised.
     """
     columns_by_feature = {feature: columns_of(feature, columns) for feature in features}
     counts = sizes(clouds)

@@ -31,7 +31,7 @@ class BallisticEncoder(Encoder):
         future: number of future frames, as in the data.
         step: time from frame to frame, s, as in the data.
         spin: prior standard deviation of each component of the spin, rad/s.
-        noise: standard deviation of an observed coordinate, m.
+        noise: standard deviation of the measurement error of each coordinate, m.
         constants: constants of the ball and the table.
 
     Raises:

@@ -43,7 +43,7 @@ class ExtrapolationEncoder(Encoder):
     Args:
         future: number of future frames, as in the data.
         step: time from frame to frame, s, as in the data.
-        noise: standard deviation of a coordinate, m.
+        noise: standard deviation of the measurement error of each coordinate, m.
 
     Raises:
         ConfigError: the inputs are not flattened frames with the numbers of `framework.flights.frames.PARTS`.

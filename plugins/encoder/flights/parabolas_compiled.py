@@ -56,7 +56,7 @@ def fit_parabolas(times, positions, visible, spans, noise, long, short, covarian
         positions: (flight, frame, 3), m; any number where the ball was not seen.
         visible: (flight, frame), whether the ball was seen.
         spans: numbers of last frames that are fitted, the largest first.
-        noise: standard deviation of a coordinate, m.
+        noise: standard deviation of the measurement error of each coordinate, m.
         long: filled with the coefficients of 1, t and t²/2, (flight, 3, axis), of the parabola through the longest
             span that a parabola fits.
         short: filled with the coefficients of the last (shortest) span, in the same form.
@@ -121,12 +121,12 @@ def fill_features(times, positions, visible, gravity, spans, noise, speed, growt
     """Fill `features` with the numbers that `extrapolation.ExtrapolationEncoder` returns for each flight.
 
     Args:
-        times: see `fit_parabolas`.
-        positions: see `fit_parabolas`.
-        visible: see `fit_parabolas`.
-        gravity: m/s².
-        spans: see `fit_parabolas`.
-        noise: see `fit_parabolas`.
+        times: (flight, frame), s.
+        positions: (flight, frame, 3), m; any number where the ball was not seen.
+        visible: (flight, frame), whether the ball was seen.
+        gravity: acceleration of a falling ball, m/s².
+        spans: numbers of last frames to which parabolas are fitted, the largest first.
+        noise: standard deviation of the measurement error of each coordinate, m.
         speed: growth of the unit of x, y and z with time, (3,), m/s, as `extrapolation.SPEED`.
         growth: growth of the unit with the square of time, (3,), m/s², as `extrapolation.GROWTH`.
         moments: times at which the ball is predicted, (future,), s.

@@ -27,7 +27,7 @@ class CellEncoder(Encoder):
         input_shape: (points, columns) of the largest cloud.
         by: name of the encoder, for messages.
         side: number of cells along each edge.
-        normalise: as in `framework.geometry.clouds.normalise_clouds`.
+        normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`).
 
     Raises:
         ConfigError: the input is not a cloud.
@@ -53,8 +53,8 @@ class CellEncoder(Encoder):
         """Return the numbers of the cells.
 
         Raises:
-            DataError: as `framework.geometry.clouds.sizes`; or `normalise` is "none" and the clouds are clearly not
-                normalised.
+            DataError: a cloud has no points, or a number of a point is not finite; or `normalise` is "none" and the
+                clouds are clearly not normalised.
         """
         counts = sizes(inputs)
         local = normalise_clouds(inputs, self.normalise, counts).clouds

@@ -22,7 +22,8 @@ class Occupancy(CellEncoder):
     Args:
         input_shape: (points, columns) of the largest cloud; coordinates in the first three columns.
         side: number of cells along each edge.
-        normalise: as in `framework.geometry.clouds.normalise_clouds`. With "robust", far outliers lie in no cell.
+        normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`). With "robust", far
+            outliers lie in no cell.
 
     Raises:
         ConfigError: the input is not a cloud.

@@ -21,8 +21,8 @@ class TDF(CellEncoder):
     Args:
         input_shape: (points, columns) of the largest cloud; coordinates in the first three columns.
         side: number of cells along each edge.
-        truncation: largest distance, in edges of a cell; larger distances are set to it.
-        normalise: as in `framework.geometry.clouds.normalise_clouds`.
+        truncation: largest distance, in edges of a cell; larger distances are set to this value.
+        normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`).
 
     Raises:
         ConfigError: the input is not a cloud.

@@ -26,9 +26,10 @@ class PointNN(Encoder):
     The maximum plus the mean over the neighbours are its new features. The maximum plus the mean over the points of the
     last stage are the features of the cloud, (width · 2^stages,).
 
-    In the paper, standard deviations are those of a batch of clouds; here they are those of each cloud, so that its
-    features do not depend on other clouds. Columns after x, y, z are not read. Neither the order of the points nor
-    padding changes the features, unless distances are equal.
+    Relative features, and relative positions, are divided by the standard deviation of all of them in the cloud. The
+    paper divides by the standard deviation over a batch of clouds; here the features of a cloud do not depend on other
+    clouds. Columns after x, y, z are not read. Neither the order of the points nor padding changes the features, unless
+    distances are equal.
 
     Args:
         input_shape: (points, columns) of the largest cloud; coordinates in the first three columns.
@@ -37,8 +38,9 @@ class PointNN(Encoder):
         stages: number of stages.
         neighbours: number of neighbours of a point in each stage; all points if there are fewer.
         frequency: α, the highest angular frequency, radians per unit of the normalised cloud.
-        base: β; the frequencies are α / β^(d/D) for d = 0, …, D - 1.
-        normalise: as in `framework.geometry.clouds.normalise_clouds`, applied to the whole cloud.
+        base: β; the D angular frequencies of an encoding are α / β^(d/D) for d = 0, …, D - 1.
+        normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`), applied to the whole
+            cloud.
 
     Raises:
         ConfigError: the input is not a cloud.

@@ -36,7 +36,7 @@ class DeepSets(CloudNetwork):
         dropout: probability of dropping a number before and after each layer that follows the maximum.
         points: number of points at the beginning of a cloud that are read; None for all. With 100 the network is the
             one that the thesis calls "micro".
-        normalise: as in `framework.geometry.clouds.normalise_clouds`.
+        normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`).
         attributes: whether columns after x, y, z are read too.
 
     Raises:

@@ -27,7 +27,7 @@ class DGCNN(CloudNetwork):
     An edge is the vector (x_j - x_i, x_i), which passes a linear layer, batch norm and LeakyReLU; the maximum of each
     channel over the neighbours is the output for the point (eq. 7, 8). The first layer finds neighbours by coordinates,
     each later layer by the outputs of the layer before. The outputs of all these layers together pass one more layer.
-    Its maximum and its mean over the cloud, one after the other, pass further layers.
+    The maximum and the mean of this layer's outputs over the cloud, concatenated, pass further layers.
 
     Padding does not change the features. The order of the points changes the features only if distances are equal, as
     in a lattice. If a cloud has fewer points than `neighbours`, all its points are neighbours; each point is then
@@ -41,7 +41,7 @@ class DGCNN(CloudNetwork):
         widths: number of outputs of each layer after them; the last is the length of the features.
         dropout: probability of dropping an output of each of these last layers.
         points: number of points at the beginning of a cloud that are read; None for all.
-        normalise: as in `framework.geometry.clouds.normalise_clouds`.
+        normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`).
         attributes: whether columns after x, y, z are read too; neighbours are found by x, y, z alone.
 
     Raises:

@@ -47,7 +47,7 @@ class Reading(NamedTuple):
     Attributes:
         columns: number of leading columns that are read.
         most: number of points at the beginning of a cloud that are read; None for all.
-        normalise: as in `framework.geometry.clouds.normalise_clouds`.
+        normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`).
     """
 
     columns: int
@@ -56,11 +56,14 @@ class Reading(NamedTuple):
 
 
 class CloudNetwork(Encoder):
-    """Base class of networks on the points of clouds, which compute few clouds at a time where possible.
+    """Base class of networks on the points of clouds.
+
+    In evaluation without a gradient, a batch is encoded in parts of few clouds, so that intermediate results stay in
+    the processor's caches.
 
     Attributes:
         reading: which columns and points of a cloud are read, and how the points are normalised.
-        rows_per_point: as in `encode_in_parts`.
+        rows_per_point: approximate number of rows of numbers that the network computes for each point.
     """
 
     reading: Reading
@@ -100,13 +103,14 @@ def concatenate_points(
 
     Args:
         clouds: (batch, points, columns).
-        normalise: as in `framework.geometry.clouds.normalise_clouds`, computed from all points.
+        normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`), computed from all
+            points.
         columns: number of leading columns that are read.
         most: number of points at the beginning of a cloud that are read; None for all.
         dtype: dtype of the returned points.
 
     Raises:
-        DataError: as `framework.geometry.clouds.sizes`.
+        DataError: a cloud has no points, or a number of a point is not finite.
     """
     counts = sizes(clouds)
     points = normalise_clouds(clouds, normalise, counts).clouds[:, :most, :columns].to(dtype)
@@ -184,10 +188,12 @@ def encode_in_parts(
     counts: Int[Tensor, "batch"],
     rows_per_point: int = 1,
 ) -> Float[Tensor, "batch features"]:
-    """Return the features that a network computes, for few clouds at a time, so that all numbers stay in the caches.
+    """Return the features that a network computes for few clouds at a time.
 
-    The function is for evaluation without a gradient: computing a gradient keeps all numbers in memory anyway, and
-    batch norm in training needs the whole batch.
+    Its intermediate results then stay in the processor's caches.
+
+    The function is for evaluation without a gradient: computing a gradient keeps all intermediate results in memory
+    anyway, and batch norm in training needs the whole batch.
 
     Args:
         network: function of concatenated points and of the number of points of each cloud.

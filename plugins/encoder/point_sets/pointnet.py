@@ -33,7 +33,7 @@ class PointNet(CloudNetwork):
         widths: number of outputs of each layer after the maximum; the last is the length of the features.
         dropout: probability of dropping an output of the last layer.
         points: number of points at the beginning of a cloud that are read; None for all.
-        normalise: as in `framework.geometry.clouds.normalise_clouds`.
+        normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`).
         attributes: whether columns after x, y, z are read too; the first matrix does not change them.
 
     Raises:

@@ -21,7 +21,7 @@ class Scale(NamedTuple):
     """Balls of one size around the centroids of a level, and the layers that their points pass.
 
     Attributes:
-        radius: radius of the balls, in units of the first level's radius in "single_scale".
+        radius: radius of the balls, as a multiple of the argument `radius` of `PointNet2`.
         neighbours: largest number of points of a ball that are read.
         widths: number of outputs of each layer.
     """
@@ -72,7 +72,7 @@ class PointNet2(CloudNetwork):
         width: factor by which the published widths of all layers are multiplied.
         dropout: probability of dropping an output of each of the two last layers.
         points: number of points at the beginning of a cloud that are read; None for all.
-        normalise: as in `framework.geometry.clouds.normalise_clouds`.
+        normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`).
         attributes: whether columns after x, y, z are read too.
 
     Raises:

@@ -20,7 +20,8 @@ class Points(Encoder):
         input_shape: (points, columns) of the largest cloud; coordinates in the first three columns.
         points: number of points; smaller clouds repeat their points.
         choice: "random", or "farthest" from the points chosen before (`plugins.encoder.points.subset`).
-        normalise: as in `framework.geometry.clouds.normalise_clouds`, applied to the whole cloud.
+        normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`), applied to the whole
+            cloud.
         seed: seed of "random"; the run's seed has no influence on it.
 
     Raises:

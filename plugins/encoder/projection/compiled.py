@@ -81,8 +81,8 @@ def halve(depth, index, coarse_depth, coarse_index):
     Args:
         depth: see the module.
         index: see the module.
-        coarse_depth: filled with the depths of the image of half the size.
-        coarse_index: filled with the indices of the image of half the size.
+        coarse_depth: (rows, columns), filled with the depths of the image of half the size, metres.
+        coarse_index: (rows, columns), filled with the indices of the points that the image of half the size shows.
     """
     coarse_depth[:] = np.inf
     coarse_index[:] = -1
@@ -104,13 +104,13 @@ def paint(cloud, index, level, nearest, farthest, image):
     """Fill `image` with the colours and depths of points; pixels without a point are 1 in all channels.
 
     Args:
-        cloud: as in the module's docstring.
-        index: (rows, columns), the row of `cloud` that is visible in each square of 2^level × 2^level pixels of
-            `image`, in the same place; negative where no point is visible.
+        cloud: (points, columns): x, y, z in the canonical camera's coordinates, metres; red, green, blue.
+        index: (rows, columns). Entry (i, j) is the row of `cloud` that is visible in square (i, j) of 2^level × 2^level
+            pixels of `image`; negative if no point is visible in the square.
         level: base-2 logarithm of the side of a square.
         nearest: depth that becomes 0 in the fourth channel, metres.
         farthest: depth that becomes 1 in the fourth channel, metres.
-        image: (4, height, width), written: red, green, blue and scaled depth.
+        image: (4, height, width), filled with red, green, blue and scaled depth.
     """
     span = farthest - nearest
     image[:] = 1.0
@@ -133,7 +133,7 @@ def splat(image, nearest, span, focal, thick, around, close, weights, filled):
         nearest: smallest depth of the fourth channel, metres.
         span: range of depths of the fourth channel, metres.
         focal: focal length, pixels.
-        thick: thickness of a surface, pixels.
+        thick: thickness of a surface, in widths of a pixel at the surface's depth.
         around: (offsets, 2), row and column of each offset in the disc of a splat, row by row.
         close: (offsets, 2), row and column of each offset in the disc that closes holes, row by row.
         weights: weight of a point, indexed by its squared distance and the squared distance of the nearest point.

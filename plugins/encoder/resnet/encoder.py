@@ -135,7 +135,8 @@ class Bottleneck(nn.Module):
     Args:
         channels: number of channels of the input.
         width: number of channels of the 3 × 3 convolution; the output has four times as many.
-        stride: stride of the 3 × 3 convolution; as in `Basic`.
+        stride: stride of the 3 × 3 convolution; with a stride above 1, or another number of channels, the input is
+            projected by a 1 × 1 convolution.
     """
 
     expansion = 4

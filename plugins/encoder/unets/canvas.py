@@ -46,7 +46,7 @@ class Box(NamedTuple):
 
 @dataclass(frozen=True)
 class CropReport:
-    """The areas of a batch of images that a cropped evaluation computed.
+    """The areas of a batch of images that a network computed in evaluation, if it computes only the subject's box.
 
     Attributes:
         boxes: box of each image that the network computed, or None for an empty image; a box may end beyond the border
@@ -97,16 +97,17 @@ class Canvas:
         head: nn.Conv2d,
         training: bool,
     ) -> tuple[Float[Tensor, "batch outputs height width"], CropReport | None]:
-        """Return the outputs of the network, and the report of a cropped evaluation.
+        """Return the outputs of the network and, for evaluation with a crop, a report of the areas that were computed.
 
-        The report is None in training, without a crop, and for an empty batch.
+        With a crop, evaluation computes only the subject's box in each image. The report is None in training, without a
+        crop, and for an empty batch.
 
         In evaluation, each call folds the normalisation into the convolutions again. This costs less than checking
         whether a weight has changed.
 
         Args:
             inputs: images; integers are divided by 255.
-            maps: function that returns the maps that `head` reads.
+            maps: function that returns the feature maps that `head` reads.
             layers: layers of the network, in the order in which `maps` uses them.
             head: last convolution.
             training: whether the network is in training; everything is then computed.
@@ -211,7 +212,12 @@ class CroppedUNet(Encoder):
 
     @abstractmethod
     def maps(self, images: Tensor, layers: Iterator[Step]) -> Tensor:
-        """Return the maps that the last convolution reads; the arguments are described at `Maps`."""
+        """Return the feature maps that the last convolution reads.
+
+        Args:
+            images: differences from the empty background; sides are multiples of the network's stride.
+            layers: iterator over functions, one for each layer of the network.
+        """
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch outputs height width"]:
         """Return colours and scales of the images."""
@@ -272,8 +278,8 @@ def require_images(
     Args:
         name: name of the encoder, for messages.
         input_shape: (channels, height, width).
-        normalisation: as in `unet.UNet`.
-        crop: as in `unet.UNet`.
+        normalisation: normalisation of the layers: "batch", "renorm" or "group".
+        crop: margin around the subject's box that evaluation computes, pixels; None: the whole image.
         least: smallest allowed number of channels of the input.
 
     Raises:

@@ -30,7 +30,14 @@ class Slim(CroppedUNet):
         input_shape: (channels, height, width); the network also reads images of other heights and widths.
         widths: channels of each level. Processors compute 16 channels at once, so that 24 cost as much as 32.
         unshuffle: side of a square, pixels.
-        normalisation, colors, scales, crop, precision, residual: as in `unet.UNet`.
+        normalisation: "batch", "renorm" or "group" (`layers.Layer`).
+        colors: number of output channels that are colours, 0 to 1.
+        scales: number of further output channels: logarithms of the scales of a density of the colours.
+        crop: margin, pixels. Evaluation computes only the subject's bounding box and this margin around it; None: the
+            whole image.
+        precision: precision of evaluation; "auto" is bfloat16 on processors with fast bfloat16 matrix products, else
+            float32.
+        residual: whether the network's output is added to the input's first `colors` channels.
 
     Raises:
         ConfigError: the input is not an image, or `crop` with `normalisation="group"`.
@@ -71,7 +78,12 @@ class Slim(CroppedUNet):
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     def maps(self, images: Tensor, layers: Iterator[Step]) -> Tensor:
-        """Return the maps that the last convolution reads; the arguments are described at `canvas.Maps`."""
+        """Return the feature maps that the last convolution reads.
+
+        Args:
+            images: differences from the empty background; sides are multiples of the network's stride.
+            layers: iterator over functions, one for each layer of the network.
+        """
         maps = next(layers)(unshuffle_pixels(images, self.unshuffle))
         across = [maps]
         for _ in range(self.levels - 1):
@@ -84,7 +96,10 @@ class Slim(CroppedUNet):
 
 
 def unshuffle_pixels(images: Float[Tensor, "batch channels height width"], side: int) -> Tensor:
-    """Return what `functional.pixel_unshuffle` returns, with channels last in memory, in a third of its time."""
+    """Return the pixels of each square of `side` × `side` pixels as channels, with channels last in memory.
+
+    The numbers are those of torch's `pixel_unshuffle`, which takes three times as long.
+    """
     batch, channels, height, width = images.shape
     squares = images.reshape(batch, channels, height // side, side, width // side, side)
     planes = squares.permute(0, 1, 3, 5, 2, 4).reshape(

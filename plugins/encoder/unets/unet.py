@@ -76,7 +76,12 @@ class UNet(CroppedUNet):
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     def maps(self, images: Tensor, layers: Iterator[Step]) -> Tensor:
-        """Return the maps that the last convolution reads; the arguments are described at `canvas.Maps`."""
+        """Return the feature maps that the last convolution reads.
+
+        Args:
+            images: differences from the empty background; sides are multiples of the network's stride.
+            layers: iterator over functions, one for each layer of the network.
+        """
         maps = images.contiguous(memory_format=torch.channels_last)
         across: list[Tensor] = []
         for level in range(self.levels):

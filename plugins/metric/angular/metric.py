@@ -59,10 +59,10 @@ class MeanAngularDeviation(Mean):
 class MedianAngularDeviation(Metric):
     """Median absolute angular deviation of the point prediction, degrees.
 
-    For several angles, the deviation of a sample is the mean over its angles, as in `angular_deviation`. The median of
-    an even number of values is the mean of the middle two. The median shows how accurate a method is on its better half
-    of the samples. In contrast, if densities have two opposite modes, the mean deviation mostly shows how often the
-    point prediction chose the wrong mode.
+    For several angles, the deviation of a sample is the mean over its angles. The median of an even number of values is
+    the mean of the middle two. The median shows how accurate a method is on its better half of the samples. In
+    contrast, if densities have two opposite modes, the mean deviation mostly shows how often the point prediction chose
+    the wrong mode.
 
     Raises:
         ConfigError: the target is not made of angles.

@@ -48,8 +48,8 @@ def brier(
 ) -> Float64[Tensor, "batch"]:
     """Return the Brier score of each sample.
 
-    For the label y, it is (y - p(y = 1))² for two classes (eq. 2.26), and Σ_k (p_k - 1[y = k])² for more classes (Brier
-    1950, eq. 2).
+    For the label y, the score is (y - p(y = 1))² for two classes (thesis eq. 2.26), and Σ_k (p_k - 1[y = k])² for more
+    classes (Brier 1950, eq. 2).
     """
     classes = probability.shape[-1]
     error = probability - torch.nn.functional.one_hot(label, classes)

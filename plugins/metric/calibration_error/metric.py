@@ -177,8 +177,8 @@ class Bins:
 def equal_width(confidence: Float64[Tensor, "sample"], bins: int) -> Int[Tensor, "sample"]:
     """Return the index of the bin of each sample, for L = `bins` bins of equal width.
 
-    The bin with index l - 1 holds the confidences with (l - 1)/L ≤ confidence < l/L (eq. 2.28), with edges lowered by
-    NEAR/2. A confidence of 1 belongs to the last bin.
+    The bin with index l - 1 holds the confidences with (l - 1)/L ≤ confidence < l/L (thesis eq. 2.28), with edges
+    lowered by NEAR/2. A confidence of 1 belongs to the last bin.
     """
     edges = torch.arange(1, bins, dtype=torch.float64, device=confidence.device) / bins
     return torch.bucketize(confidence, edges - NEAR / 2, right=True)
@@ -236,7 +236,7 @@ def sum_by_bin(
 
 
 def expected_error(bins: Bins) -> Float64[Tensor, ""]:
-    """Return the expected calibration error Σ_l |B_l|/Q |conf(B_l) - acc(B_l)| (eq. 2.31); NaN without samples.
+    """Return the expected calibration error Σ_l |B_l|/Q |conf(B_l) - acc(B_l)| (thesis eq. 2.31); NaN without samples.
 
     conf(B_l) is the mean confidence in bin l, acc(B_l) the share of right predictions, |B_l| the number of samples in
     the bin, and Q the number of all samples. The error is computed as Σ_l |Σ conf - Σ right| / Q, so that empty bins

@@ -30,13 +30,16 @@ SECANTS = 2
 
 
 def border(density: Distribution, value: Tensor, mass: float, samples: int) -> Region:
-    """Return `Region`: the masses of the regions that end at the targets, and the size of the region of mass `mass`.
+    """Return the masses of the highest-density regions that end at the targets, and the size of one of mass `mass`.
 
-    Both are exact for classes, for normal densities, for densities that `highest_region` knows, and for an angle whose
-    density a grid resolves. Otherwise both are estimated from `samples` draws: the masses follow from the rank of the
-    target's density among the densities of the draws. This rank depends on the draws, but it is exactly uniform if the
-    density is the true one. The size is a number of labels, or is in radians or the unit of the target; it is NaN for a
-    target of several numbers. If the target is drawn from the density, a number drawn uniformly between the masses
+    The region that ends at a target holds the values whose density is higher than that of the target. Its mass is `low`
+    of the result; `high` is the mass of all values with at least the density of the target.
+
+    Masses and size are exact for classes, for normal densities, for densities that `highest_region` knows, and for an
+    angle whose density a grid resolves. Otherwise they are estimated from `samples` draws: the masses follow from the
+    rank of the target's density among the densities of the draws. This rank depends on the draws, but it is exactly
+    uniform if the density is the true one. The size is a number of labels, or is in radians or the unit of the target;
+    it is NaN for a target of several numbers. If the target is drawn from the density, a number drawn uniformly between
     `low` and `high` is uniform on [0, 1].
 
     Args:
@@ -71,10 +74,12 @@ def border(density: Distribution, value: Tensor, mass: float, samples: int) -> R
 
 
 def class_border(density: Distribution, value: Int[Tensor, "batch"], mass: float) -> Region:
-    """Return `Region`, the masses of the regions up to the true class and the size of the region of mass `mass`.
+    """Return the masses of the regions that end at the true class, and the size of the region of mass `mass`.
 
-    All are sums over the classes. The size is the number of most likely labels that hold `mass` together. The last of
-    these labels counts only with the share of its probability that is needed, so that the size is not an integer.
+    `low` of the result is the probability of all classes that are more likely than the true class, and `high` that of
+    all classes that are at least as likely. The size is the number of most likely labels that hold `mass` together. The
+    last of these labels counts only with the share of its probability that is needed, so that the size is not an
+    integer.
     """
     probability = class_probabilities(density).T
     at = probability.gather(0, require_labels(value.long(), len(probability)).unsqueeze(0))
@@ -85,9 +90,11 @@ def class_border(density: Distribution, value: Int[Tensor, "batch"], mass: float
 
 
 def angle_border(moments: CircularMoments, log_prob: Float[Tensor, "batch"], mass: float) -> Region:
-    """Return `Region` for one angle: the masses of the regions up to the target and the size of the region of `mass`.
+    """Return, for one angle, the masses of the regions that end at the target, and the size of the region of `mass`.
 
-    They are computed by cubic interpolation of the density and its derivative on a fine grid.
+    `low` of the result is the probability of all angles with a higher density than the target, and `high` that of all
+    angles with at least its density. All results are computed by cubic interpolation of the density and its derivative
+    on a fine grid.
 
     Args:
         moments: moments of the density, which give its values on the grid.
@@ -247,7 +254,7 @@ def _root(function: Callable[[Tensor], Tensor], low: Tensor, high: Tensor) -> Te
 
 
 def sampled_border(density: Distribution, value: Tensor, mass: float, samples: int) -> Region:
-    """Return `Region`, estimated from samples of the density.
+    """Return the masses of the regions that end at the target, and the size of the region of `mass`, from samples.
 
     The masses follow from the rank of the target's density among the densities of the samples. For one number, the size
     of the region {x: p(x) ≥ t} is estimated as E[1{p(X) ≥ t} / p(X)], where the level t is the quantile of the sampled
@@ -281,7 +288,7 @@ def _count_cells(mass: Float[Tensor, "cell batch"], wanted: float) -> Float[Tens
 def coverage_probability(
     low: Tensor, high: Tensor, levels: Float[Tensor, "level"]
 ) -> Float[Tensor, "batch level"]:
-    """Return for each level the probability that a number drawn uniformly from [`low`, `high`] does not exceed it.
+    """Return for each level the probability that a number drawn uniformly from [`low`, `high`] is at most the level.
 
     This probability replaces a random draw if other values have the same density as the target (nonrandomized transform
     of Czado, Gneiting & Held 2009, eq. 2).

@@ -27,17 +27,18 @@ class DecisionCost(Metric):
 
     - `decision_cost`: mean cost of these actions under the true target.
     - `decision_cost_fixed`: mean cost of the best constant decision, which chooses the same action for all samples.
-    - `decision_cost_oracle`: mean cost of the best action for each truth.
+    - `decision_cost_oracle`: mean cost if the action that is best for the true class or region were always chosen.
     - `share_<action>`: share of samples for which the action was chosen.
 
-    A cost may be infinite (a forbidden action) or negative (a gain). A truth of probability 0 adds no cost; any higher
-    probability excludes an action of infinite cost. The first of several equally good actions is chosen.
+    A cost may be infinite (a forbidden action) or negative (a gain). A class or region of probability 0 adds no cost;
+    at any higher probability, an action whose cost for this class or region is infinite is not chosen. The first of
+    several equally good actions is chosen.
 
     Args:
-        costs: table of truth × action: row i holds the cost of each action if class or region i is true, in any unit;
-            by default 0 for the right class or region and 1 for every other.
+        costs: table in which row i holds the cost of each action if class or region i is true, in any unit; by default
+            0 for the right class or region and 1 for every other.
         actions: names of the columns; by default the names of the classes or regions. There may be more actions than
-            truths, for example "ask a person".
+            classes or regions, for example "ask a person".
         edges: for a real number, ascending values that divide the line into regions; the first region is below the
             first edge.
         edges_deg: for an angle, ascending angles within one turn that divide the circle, degrees; the first region
@@ -47,7 +48,7 @@ class DecisionCost(Metric):
 
     Raises:
         ConfigError: the table does not fit the target, the edges or the action names; it contains NaN; or all actions
-            are forbidden for some truth.
+            are forbidden for some class or region.
         UserError: densities are NaN.
         DataError: a target is not a class of the data set.
     """

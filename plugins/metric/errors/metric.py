@@ -18,8 +18,8 @@ FIRST = 6
 class Errors(Mean):
     """Base class of metrics that are computed from the mean of |error| or error², such as MAE and RMSE.
 
-    A metric evaluates the point prediction. It is computed over all numbers of the target, and for each
-    number separately if there are few.
+    The error is that of the point prediction. Its mean is taken over all numbers of the target and, if there are few,
+    also for each number.
 
     Raises:
         ConfigError: the target is not real-valued.

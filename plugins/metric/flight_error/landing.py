@@ -1,4 +1,4 @@
-"""Landing places of a ball, where its path comes down through a horizontal plane, and accuracy of sampled ones."""
+"""Landing places of a ball, where its path comes down through a horizontal plane, and accuracy of sampled places."""
 
 from typing import NamedTuple
 

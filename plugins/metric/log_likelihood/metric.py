@@ -43,8 +43,9 @@ class LogLikelihood(Moments):
     If log_prob is a Monte Carlo estimate, the metric has additional results: the debiased mean, which is the mean
     without its first-order bias; the sampling error, which is the standard error due to sampling only; the mean and the
     largest number of samples per item; and the number of items that did not reach the requested tolerance. The debiased
-    mean and the sampling error are NaN if there is only one replicate. For a density that does not declare whether its
-    log_prob draws samples, the only additional result is the sampling error, which is NaN.
+    mean and the sampling error are NaN if the samples are not divided into several independent parts. For a density
+    that does not declare whether its log_prob draws samples, the only additional result is the sampling error, which is
+    NaN.
     """
 
     bibtex = "gneiting2007strictly"

@@ -20,7 +20,7 @@ class MutualInformation(Metric):
       for a single model.
     - `total_entropy`: the sum of both parts, which is the entropy of the mixture.
 
-    Each also has a standard error, with the ending `_sem`.
+    Each of the three results also has a standard error, with the ending `_sem`.
 
     Raises:
         UserError: an entropy is NaN.

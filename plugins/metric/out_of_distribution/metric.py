@@ -106,7 +106,7 @@ def required_score(density: Distribution) -> Float64[Tensor, "batch"]:
     """Return the outlier score of the input of each density.
 
     Raises:
-        ConfigError: the densities have no such score.
+        ConfigError: the densities have no outlier score.
     """
     score = outlier_score(density)
     if score is None:
@@ -133,9 +133,9 @@ def uncertainty_score(density: Distribution) -> Float64[Tensor, "batch"]:
 def ranking(
     outliers: Float[Tensor, "outlier"], test: Float[Tensor, "sample"]
 ) -> dict[str, Float64[Tensor, ""]]:
-    """Return `auroc`, its error, `aupr` and `fpr95` of two sets of scores, with outliers as positives.
+    """Return `auroc`, `auroc_sem`, `aupr` and `fpr95` of two sets of scores, with outliers as positives.
 
-    All are NaN if a set is empty.
+    All results are NaN if one of the two sets is empty.
     """
     test_count, outlier_count = len(test), len(outliers)
     if test_count == 0 or outlier_count == 0:

@@ -25,8 +25,8 @@ class Transform(NamedTuple):
 def transform(density: Distribution, value: Tensor, steps: int) -> Transform:
     """Return the distribution function at both ends of the interval of numbers that are rounded to each stored value.
 
-    A stored value stands for all values that are rounded to it: half a step to either side; a stored 0 or 1 also stands
-    for all values below or above.
+    A stored value stands for all values that are rounded to it: half a step to either side; a stored 0 also stands for
+    all values below 0, and a stored 1 for all values above 1.
 
     Args:
         density: density whose distribution function is known for each value.

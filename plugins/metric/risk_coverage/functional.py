@@ -25,7 +25,7 @@ def curve(confidence: Float[Tensor, "count"], risk: Float[Tensor, "count"]) -> F
 def area(curve: Float[Tensor, "count"]) -> Float[Tensor, ""]:
     """Return the area under the curve: the mean over coverages 1/n, ..., 1 (Geifman, Uziel & El-Yaniv 2019, eq. 3).
 
-    It is NaN without predictions.
+    The area is NaN without predictions.
     """
     return curve.mean()
 
@@ -48,7 +48,7 @@ def _kept_count(count: int, coverage: float) -> int:
 def areas_without_each(
     confidence: Float[Tensor, "count"], risk: Float[Tensor, "count"]
 ) -> Float[Tensor, "count"]:
-    """Return the area under the curve without each prediction in turn; at least 2 are required.
+    """Return the areas under the n curves that each leave out one of n predictions; n is at least 2.
 
     Let S(k) be the expected total risk of the k most confident predictions, and let the positions a + 1 to e of the
     order be the group of ties with prediction j. Without j, the total risk of the k most confident is S(k) for k ≤ a,

@@ -49,7 +49,7 @@ class RiskCoverage(Metric, HasFigure):
     confident predictions count with their mean risk, so that their order has no effect.
 
     Args:
-        confidence: "entropy" for minus the predictive entropy; "mode" for the (log-)probability of the mode.
+        confidence: "entropy" for minus the predictive entropy; "mode" for the probability or log-density at the mode.
 
     Raises:
         ConfigError: the targets are images.

@@ -35,7 +35,7 @@ class SymmetricRotation(Mean):
     - `rotation_log_likelihood`: log-density of the label with respect to the volume in which all rotations measure π²,
       nats. Murphy et al. use this convention: the uniform density has -log π² = -2.29 nats. A density p per radian of
       azimuth, elevation e and tilt becomes 8 p / cos e. A density that gives mass to elevations outside of ±π/2
-      describes a rotation by two triples of angles, and both are added.
+      describes a rotation by two triples of angles, and the densities of both triples are added.
     - `optimum`: the same log-density under the exact density of the labels; NaN if it is not known.
     - `optimum_gap`: mean of `optimum` minus `rotation_log_likelihood`, label by label, so that the noise of the labels
       nearly cancels.

@@ -107,7 +107,7 @@ class CorrespondenceError(Metric):
 
 
 def require_vertices(target: Target, name: str) -> None:
-    """Check that a target can hold x, y, z of every vertex.
+    """Check that a target can hold x, y, z of every vertex; `name` is the name of the metric in the message.
 
     Raises:
         ConfigError: the target is not real-valued, or its number of values is not a multiple of 3.

@@ -28,8 +28,8 @@ class Distillation(Objective):
     teacher is an ensemble, p is the mixture of its members, and one network learns the density of the whole ensemble.
     The loss on the targets of the data stays: the teacher has the share weight/(1 + weight) of the sum.
 
-    The teacher predicts in evaluation mode and is not trained. The trained student does not contain it. Batch norm
-    normalises by the moments of the batch, and does not update the running moments.
+    The teacher predicts in evaluation mode and is not trained. The trained student does not contain the teacher. Batch
+    norm normalises by the moments of the batch, and does not update the running moments.
 
     Args:
         teacher: run folder, checkpoint file or MLflow run id of the teacher.
@@ -84,7 +84,8 @@ class Distillation(Objective):
         """Refuse data to which the teacher does not apply.
 
         Raises:
-            ConfigError: as in the docstring of the class.
+            ConfigError: the teacher's inputs or targets differ from those of `data` or are scaled in another way; or
+                the teacher's data has other settings, and `other_data` is false.
         """
         source = self.description
         compared = {

@@ -50,7 +50,8 @@ class Discriminators(nn.Module):
 
     Args:
         scales: number of discriminators.
-        width, layers: as in `PatchDiscriminator`.
+        width: channels of the first layer of each discriminator.
+        layers: number of layers of stride 2 of each discriminator.
     """
 
     def __init__(self, scales: int, width: int, layers: int) -> None:

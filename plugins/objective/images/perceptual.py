@@ -30,6 +30,11 @@ class FeatureDistance(Objective):
 
     The features of true images are cached until the cache is full. The key is a hash of the image's content, so that
     the distance is correct even if the true image of a sample changes between epochs.
+
+    Args:
+        weight: factor of the distance.
+        network: network whose features are compared.
+        cache: MiB of features of true images that are kept in memory.
     """
 
     def __init__(self, weight: float, network: VGG, cache: int) -> None:
@@ -94,8 +99,8 @@ class Perceptual(FeatureDistance):
 
     Args:
         weight: factor α of L_VGG.
-        weights: torchvision's file of the network's weights. There is no substitute for it; without the file choose
-            objective=random_features, whose network is not trained.
+        weights: torchvision's file of the network's weights. Without this file choose objective=random_features, whose
+            network is not trained.
         layers: 16, with features at four depths, or 19, with features at five.
         cache: MiB of features of true images that are kept in memory.
 

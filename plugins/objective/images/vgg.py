@@ -74,8 +74,8 @@ class VGG(nn.Module):
 def layers_of(depth: Depth, last: tuple[int, int]) -> list[tuple[int, int, int]]:
     """Return all convolutions up to `last`, in order, with their indices in torchvision's files.
 
-    Each is a triple: block, number of the convolution in the block, and index in torchvision's `features`. `last` is
-    the block and the number of the last convolution whose output is a feature.
+    Each convolution is a triple: block, number of the convolution in the block, and index in torchvision's `features`.
+    `last` holds the block, and the number in the block, of the last convolution whose output is a feature.
     """
     layers, index = [], 0
     for block, count in enumerate(CONVOLUTIONS[depth]):

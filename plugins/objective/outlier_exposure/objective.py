@@ -30,7 +30,8 @@ class OutlierExposure(Objective):
 
     Outliers are either samples of the training split of other data, with the augmentation of that data, or uniform
     random numbers. Each step draws new outliers, with replacement, from torch's global generator. Batch norm treats
-    outliers as in a test: it normalises them by the running moments of the training data, and does not update these.
+    outliers as in a test: it normalises them by the running moments of the training data, and does not update these
+    moments.
 
     Args:
         weight: factor λ of the penalty.
@@ -144,7 +145,7 @@ def uniform_range(low: float | None, high: float | None, *, other: bool) -> tupl
     `other` says whether a data set of outliers is set.
 
     Raises:
-        ConfigError: both sources of outliers are set, or none, or the range is empty.
+        ConfigError: both a range and a data set are given, or neither, or the range is empty.
     """
     bounds = [number for number in (low, high) if number is not None]
     if other and not bounds:

@@ -59,7 +59,8 @@ def boundary(
 
     `adjacent` is the result of `find_adjacent_faces`. `single_sample` is True if a pixel is one sample, and False if it
     is the mean of several. `grad_image` is the gradient of the loss with respect to the image, (height, width,
-    channels). `colors`, `texture` and `lens` are as in `shading`.
+    channels). `colors` holds the channels of each vertex, `texture` a `textures.TextureArrays` or None, and `lens` fx,
+    fy, cx, cy. The other arrays are described in `raster`.
     """
     height, width = face.shape
     top, bottom = max(box[0] - 1, 0), min(box[1] + 1, height)

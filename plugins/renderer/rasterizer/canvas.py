@@ -1,7 +1,7 @@
 """Data that is reused from image to image: arrays to draw in, checked faces, and projected vertices.
 
-Whether data is unchanged is decided by comparing the stored numbers with the new numbers one by one, because an array
-may be changed in place. The comparison stops at the first difference.
+Data counts as unchanged if all stored numbers equal the new numbers. They are compared one by one, because an array may
+be changed in place. The comparison stops at the first difference.
 """
 
 from functools import cached_property
@@ -90,8 +90,8 @@ class MeshCache:
 class Canvas:
     """Arrays of one image, described in `raster`.
 
-    `depth` and `face` show the background outside of `box`. `counts` are the counts of `raster.rasterise` for the faces
-    in these arrays. `cut` is the number of vertices that the near plane cuts off.
+    `depth` and `face` show the background outside of `box`. `counts` holds the number of faces with each outcome
+    (`raster.rasterise`). `cut` is the number of vertices that the near plane cuts off.
     """
 
     def __init__(self) -> None:
@@ -188,7 +188,7 @@ class Canvas:
     def record_mesh(self, corners: Corners, cull: bool, box: Box, counts: np.ndarray) -> None:
         """Record the mesh that `depth` and `face` show, the box of its pixels, and the counts of its faces.
 
-        `corners` and `cull` are as in `shows`.
+        `corners` are the faces of the mesh. If `cull` is true, faces seen from behind were left out.
         """
         self._shown_mesh, self.box, self.counts = (corners, cull), box, counts
 

@@ -283,7 +283,8 @@ def check_corners(name: str, face_indices: Tensor) -> None:
 def check_indices(name: str, face_indices: Tensor, count: int, of: str) -> None:
     """Check that a tensor on any device holds three indices from 0 to `count` - 1 per face.
 
-    The arguments are those of `describe_out_of_range`.
+    `name` is the name of the indices in the message, and `of` names the elements that they refer to, such as
+    "vertices".
     """
     check_corners(name, face_indices)
     if face_indices.numel() and not (int(face_indices.min()) >= 0 and int(face_indices.max()) < count):
@@ -293,7 +294,8 @@ def check_indices(name: str, face_indices: Tensor, count: int, of: str) -> None:
 def to_corners(name: str, face_indices: Tensor, count: int, of: str, mesh_cache: MeshCache) -> Corners:
     """Return face indices on the CPU in the form that kernels read, after checking that they lie below `count`.
 
-    `mesh_cache` holds the results for recent meshes. The other arguments are those of `describe_out_of_range`.
+    `mesh_cache` holds the results for recent meshes. `name` is the name of the indices in messages, and `of` names the
+    elements that they refer to, such as "vertices".
     """
     check_corners(name, face_indices)
     readable = face_indices.dtype in (torch.int32, torch.int64)

@@ -12,9 +12,9 @@ from plugins.renderer.rasterizer.raster import FARTHEST, compiled, on_screen
 def clip(camera_points, faces, focal, principal, near):
     """Return the visible parts of all faces that the near plane cuts, as triangles.
 
-    The visible part of a face with one corner in front of the plane is one triangle; the visible part of a face with
-    two such corners is divided into two triangles. A new corner on an edge is computed from the edge's vertices in the
-    order of their indices, so that neighbouring faces get the same corner.
+    The arguments are described in `raster`. The visible part of a face with one corner in front of the plane is one
+    triangle; the visible part of a face with two such corners is divided into two triangles. A new corner on an edge is
+    computed from the edge's vertices in the order of their indices, so that neighbouring faces get the same corner.
 
     Returns:
         Corners of the triangles, (corners, 5), as rows of `screen` (see `raster`); triangles as indices of these rows,

@@ -423,7 +423,8 @@ def add_gradients(
     """Add the gradients to the arrays `grad_*`, by the method that `settings.gradient` names.
 
     `grad_points` is the gradient with respect to the vertices in camera coordinates. The arrays of inputs that need no
-    gradient are None. The other arguments are those of `backward`.
+    gradient are None. `image_gradients` are the gradients of the loss with respect to "color" and "depth". `color`
+    holds the colours of the image, which only the gradient "nmr" needs.
     """
     canvas, lens, colors, texture = rendered.lease.canvas, scene.lens, scene.colors, scene.texture
     grad_image, grad_depth = image_gradients.get("color"), image_gradients.get("depth")

@@ -68,10 +68,11 @@ def interior(
     """Add the gradients through weights, colours and depths inside of faces to the float64 arrays `grad_*`.
 
     Gradients that are None are not computed; `grad_points` and `grad_lens` must both be given, or both be None.
-    `colors`, `texture`, `lens` and `face` are as in `shading`. `scratch` holds three working arrays: int32 (faces,)
-    filled with -1, and two with any content, (n, 20) and int32 (n,), where n is at least the number of faces in view.
-    `grad_image` and `grad_depth` are the gradients of the loss with respect to the colours, (height, width, channels),
-    and the depths, (height, width), or None.
+    `colors` holds the channels of each vertex, `texture` a `textures.TextureArrays` or None, `lens` fx, fy, cx, cy, and
+    `face` the index of the face that each pixel shows. `scratch` holds three working arrays: int32 (faces,) filled with
+    -1, and two with any content, (n, 20) and int32 (n,), where n is at least the number of faces in view. `grad_image`
+    and `grad_depth` are the gradients of the loss with respect to the colours, (height, width, channels), and the
+    depths, (height, width), or None.
     """
     top, bottom, left, right = box
     slots, sums, owners = scratch
@@ -151,8 +152,8 @@ def interior(
 def ray_beside(camera_points, faces, index, sums, slot, w0, w1, w2, inverse):
     """Return x and y of the ray (x, y, 1) to the point of a face with weights w0, w1, w2, and 1 / Σ m for this ray.
 
-    `sums` and `slot` are as in `start_sums`. `inverse` is 1 / Σ m for the ray through the pixel beside the face. It is
-    0 if the face is seen edge-on; all three returned numbers are then 0.
+    Row `slot` of `sums` belongs to the face (`start_sums`). `inverse` is 1 / Σ m for the ray through the pixel beside
+    the face. If the face is seen edge-on, `inverse` and all three returned numbers are 0.
     """
     a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
     x = w0 * camera_points[a, 0] + w1 * camera_points[b, 0] + w2 * camera_points[c, 0]
@@ -200,8 +201,8 @@ def start_sums(camera_points, faces, index, sums, slot):
 def add_face_gradient(camera_points, faces, index, sums, slot, lens, grad_points, grad_lens):
     """Add the gradient of a face, computed from its row of `sums`, to `grad_points` and `grad_lens`.
 
-    The derivatives are ∂m_0/∂B = C×r, ∂m_0/∂C = r×B, and likewise for m_1 and m_2. `sums` and `slot` are as in
-    `start_sums`.
+    The derivatives are ∂m_0/∂B = C×r, ∂m_0/∂C = r×B, and likewise for m_1 and m_2. Row `slot` of `sums` belongs to the
+    face (`start_sums`).
     """
     a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
     ax, ay, az = camera_points[a, 0], camera_points[a, 1], camera_points[a, 2]

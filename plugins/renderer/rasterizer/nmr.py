@@ -198,10 +198,10 @@ def sum_gains(
         crossing: position at which the edge crosses the line.
         share: motion of the crossing for a motion of 1 of the edge's start; for the edge's end it is 1 - `share`.
         least: distance that is added to every distance, pixels.
-        pixel_positions: see `collect_gradient_pixels`.
-        owner: see `collect_gradient_pixels`.
-        value: see `collect_gradient_pixels`.
-        slopes: see `collect_gradient_pixels`.
+        pixel_positions: position of each stored pixel in its line.
+        owner: face that each stored pixel shows.
+        value: I · g of each stored pixel, for its colour I and the gradient g with respect to it.
+        slopes: (channels, stored pixels), g.
         gains: working array.
     """
     count = last - first

@@ -1,9 +1,9 @@
 """The renderer in plain torch: a reference for tests of the compiled kernels, and the implementation on a GPU.
 
-Every pixel in the bounding box of a face is tested, `PAIRS` pairs of face and pixel at a time. The nearest face is
-found by a minimum over 64-bit integers. The upper half of such an integer holds the bits of the depth, whose order is
-that of the depths; the lower half holds the index of the face. Inside of faces, autograd gives the gradients of colours
-and depths. Faces that the near plane cuts are left out.
+Every pixel in the bounding box of a face is tested, `PAIRS` pairs of face and pixel at a time. The nearest face at a
+pixel is found by a minimum over 64-bit integers. The upper half of such an integer holds the bits of the depth, whose
+order is that of the depths; the lower half holds the index of the face. Inside of faces, autograd gives the gradients
+of colours and depths. Faces that the near plane cuts are left out.
 """
 
 from collections.abc import Iterator

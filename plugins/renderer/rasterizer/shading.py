@@ -1,7 +1,8 @@
 """Colours, depths, texture coordinates and normals of the visible face at each pixel; compiled functions.
 
-Arrays are described in `raster`. Corners are at their projected positions, not rounded. A pixel that a face covers only
-because its corners were rounded lies less than 1/256 pixel beside the face; it shows the nearest point of the face.
+Arrays are described in `raster`. The visible faces were found with corners rounded to 1/256 pixel; here the corners are
+not rounded. A pixel may therefore lie up to 1/256 pixel beside the face that it shows. It then has the colour of the
+nearest point of the face.
 
 Args:
     colors: (vertices, channels), or None for white vertices.
@@ -53,7 +54,8 @@ def pixel_weights(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column):
 def weights_beside(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column):
     """Return the barycentric weights of the point of a face that is nearest, on the screen, to a pixel beside the face.
 
-    The arguments are those of `pixel_weights`.
+    The arguments are those of `pixel_weights`: column, row and 1 / depth of each corner, then row and column of the
+    pixel.
     """
     x, y = column * SUBPIXELS, row * SUBPIXELS
     to_ab, part_ab = to_edge(ax, ay, bx, by, x, y)

@@ -59,9 +59,10 @@ class SoftImage:
 
 
 def blur_margin(sigma: float, size: tuple[int, int]) -> float:
-    """Return the largest distance from a face, in pixels, at which a pixel outside of the face still shows it.
+    """Return the largest distance from a face, in pixels, at which a pixel outside of the face still shows the face.
 
-    `sigma` is σ of the module's docstring, and `size` the (height, width) of the image in pixels.
+    `sigma` is σ, the blur of coverage, a squared distance in units in which the image's shorter side is 2. `size` is
+    the (height, width) of the image in pixels.
     """
     return math.sqrt(REACH * sigma) * min(size) / 2
 
@@ -81,15 +82,15 @@ def render(
     """Return the soft image of the vertices from `raster.project`.
 
     Args:
-        camera_points: see `raster`.
-        screen: see `raster`.
+        camera_points: (vertices, 3), vertices in camera coordinates, metres.
+        screen: (vertices, 5), projected vertices, as `raster` describes them.
         faces: (faces, 3), indices of vertices.
         colors: (vertices, channels).
         lens: fx, fy, cx, cy, pixels.
         cull: leave out faces seen from behind.
         size: height and width of the image, pixels.
-        sigma: σ of the module's docstring.
-        gamma: γ of the module's docstring.
+        sigma: σ, the blur of coverage, a squared distance in units in which the image's shorter side is 2.
+        gamma: γ, the blur of depth, in units of the ratio of the nearest depth to a face's depth.
         counts: the number of faces with each outcome is added, as in `raster.rasterise`.
     """
     positions, bounds = np.zeros((len(camera_points), 2)), np.zeros((len(faces), 4), np.int64)

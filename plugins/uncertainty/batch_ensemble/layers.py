@@ -16,7 +16,7 @@ class RankOne(nn.Module):
     """Layer of the weights W ∘ (s_m r_mᵀ) for member m, computed as (W (x ∘ r_m)) ∘ s_m plus a bias of the member.
 
     Factors are stored as their difference from 1, so that weight decay draws them to 1 and members to each other.
-    Outside of `several_members`, the layer is that of the first member.
+    Outside of a block `with several_members(...)`, the layer is that of the first member.
 
     Args:
         layer: the layer, whose weights are shared; its bias becomes the initial bias of every member.
@@ -81,7 +81,8 @@ class RankOne(nn.Module):
 def replace_layers(module: nn.Module, members: int, spread: float) -> int:
     """Replace all layers of the classes LAYERS inside a module by `RankOne` layers; return the number of these layers.
 
-    The module is changed in place. `members` and `spread` are as in `RankOne`.
+    The module is changed in place. `members` is the number of members, and `spread` the standard deviation of the
+    initial factors around 1.
     """
     count = 0
     for name, child in list(module.named_children()):

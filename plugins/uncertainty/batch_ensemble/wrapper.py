@@ -26,8 +26,8 @@ class BatchEnsemble(Uncertainty):
     """Mixture, with equal weights, of T members that share most weights (BatchEnsemble; Wen et al. 2020).
 
     In each linear and convolutional layer of the network in front of the density head, member m multiplies the inputs
-    by factors r_m and the outputs by factors s_m, and has its own bias. All other parts are shared, also the density
-    head. Every member learns from every sample: the loss is the mean over members, and a step takes about as long as
+    by factors r_m and the outputs by factors s_m, and has its own bias. All other parts, also the density head, are
+    shared. Every member learns from every sample: the loss is the mean over members, and a step takes about as long as
     that of T models. With `members=1` nothing is added, and the wrapper equals the wrapped model to the last bit.
 
     Args:
@@ -38,8 +38,9 @@ class BatchEnsemble(Uncertainty):
         members: number of members that are used, counted from the first; may be lowered after training (a knob).
 
     Raises:
-        ConfigError: the model has no such layer, an encoder cannot be used in this way, the model is inside another
-            wrapper, or more members are used than were trained.
+        ConfigError: the model has no linear or convolutional layer in front of the density head, a layer of an encoder
+            does not keep one row for each input, the model is inside another wrapper, or more members are used than
+            were trained.
     """
 
     varies_weights = True

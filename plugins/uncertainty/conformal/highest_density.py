@@ -84,7 +84,7 @@ class Line:
         return (self._log_whole - self._log_less(level)).clamp(min=0)
 
     def level_of(self, score: Float[Tensor, ""]) -> Float[Tensor, "item"]:
-        """Return for each item the level at which `score_of` equals `score`, with an error of 1e-12.
+        """Return for each item the level of the log-density at which `score_of` equals `score`, with an error of 1e-12.
 
         The equation is solved by regula falsi in the Illinois variant.
         """
@@ -122,7 +122,7 @@ class Line:
     def ends(self, level: Float[Tensor, "item"]) -> Ends:
         """Return the intervals of each item in which log p ≥ level.
 
-        If log p of an item is NaN, it has no intervals and the length NaN.
+        An item whose log p is NaN has no intervals and the length NaN.
         """
         inside = self.heights >= level
         start, stop = self.nodes, self.nodes.roll(-1, 0)

@@ -136,8 +136,8 @@ def coverage_remark(count: int, miscoverage: float) -> str:
     """Return a remark on how far the coverage may deviate from the stated one, and how many scores would suffice.
 
     The threshold is fitted to n = `count` scores of the validation split. The coverage of the sets with this threshold
-    is itself random: Beta(k, n + 1 - k) for distinct scores, with k as in `threshold` (Vovk 2012, prop. 2a). Its mean
-    over validation splits is k / (n + 1).
+    is itself random: Beta(k, n + 1 - k) for distinct scores, with k = ⌈(n + 1)(1 - α)⌉ for α = `miscoverage` (Vovk
+    2012, prop. 2a). The mean of the coverage over validation splits is k / (n + 1).
     """
     left_out = _left_out(count, miscoverage)
     if not left_out:

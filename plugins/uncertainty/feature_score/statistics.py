@@ -111,8 +111,8 @@ def mahalanobis(
 ) -> Float[Tensor, "batch"]:
     """Return the squared Mahalanobis distance of features from the nearest class, float64 (Lee et al. 2018, eq. 2).
 
-    Classes without samples are left out; without any sample, the distances are 0. Arguments other than the features
-    are those of `Clusters`.
+    Classes without samples are left out; without any sample, the distances are 0. `means`, `counts` and `whitening` (W
+    with WᵀW = Σ⁻¹) are fields of `Clusters`.
     """
     present = means[counts > 0]
     if not len(present):
@@ -125,7 +125,7 @@ def mahalanobis(
 def choose_samples(parts: Parts, most: int) -> Float[Tensor, "sample feature"]:
     """Return the features of all samples, or of `most` random ones if there are more, in their order.
 
-    The choice depends on the number of samples only.
+    The random choice depends only on the number of samples.
     """
     count = sum(len(features) for features, _ in parts())
     order = torch.randperm(count, generator=torch.Generator().manual_seed(SEED))

@@ -48,11 +48,12 @@ class FeatureScore(Uncertainty, ReadsTraining):
     - "relative_mahalanobis": this distance minus the distance in the normal density of all classes together (Ren et al.
       2021).
     - "knn": distance from the k-th nearest of the stored training samples (Sun et al. 2022).
-    - "energy": -log Σ exp of the logits (Liu et al. 2020), which needs no statistics.
+    - "energy": -log Σ exp of the logits (Liu et al. 2020), which needs no statistics of training samples.
 
-    `calibrate` computes the statistics from the training split; without one, from the samples that it is given. Before
-    `calibrate`, the scores of distances are 0. `framework.distributions.unchanged.outlier_score` reads the score of a
-    density. A wrapper around this one drops the scores, unless it leaves the density unchanged too.
+    `calibrate` computes the statistics from the training split. If there is no training split, it uses the samples that
+    it is given. Before `calibrate`, the scores of distances are 0. `framework.distributions.unchanged.outlier_score`
+    reads the score of a density. A wrapper around this one drops the scores, unless it leaves the density unchanged
+    too.
 
     Args:
         method: one of the methods above.

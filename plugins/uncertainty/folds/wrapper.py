@@ -128,7 +128,10 @@ class Folds(Uncertainty, SelfTraining):
         return mixtures
 
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
-        """Return the mean loss of all models for each sample, nats; its gradient trains each as it would alone."""
+        """Return the mean loss of all models for each sample, nats.
+
+        Its gradient trains each model as the model would train alone.
+        """
         return independent_penalty(self.models.losses_of_all(inputs, target))
 
     def training_densities(self, inputs: Tensor) -> Distribution:
@@ -216,7 +219,7 @@ class Folds(Uncertainty, SelfTraining):
 def fit_log_weights(log_prob: Float[Tensor, "sample group"]) -> Float[Tensor, "group"]:
     """Return the logarithms of the weights of highest likelihood, by expectation maximisation, float64.
 
-    PSEUDO samples are added to the share of each group, so that no weight is 0.
+    The fit counts PSEUDO additional samples for each group, so that no weight is 0.
 
     Args:
         log_prob: log-densities of the samples by each group, nats.

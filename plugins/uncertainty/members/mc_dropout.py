@@ -35,7 +35,7 @@ class Layout(NamedTuple):
         vectorised: True if `torch.vmap` runs the network; layers before the first dropout layer are then computed only
             once for all masks. False if the network is run on one copy of each input for each mask.
         widest: largest number of values that enter a dropout layer or, without vmap, the network, for one input and one
-            mask. It measures the memory that a pass needs.
+            mask. The memory that a pass needs grows with this number.
     """
 
     vectorised: bool

@@ -33,7 +33,7 @@ class Refined(Uncertainty):
 
     Args:
         steps: initial value of the attribute.
-        offsets: frequency offsets of the data, ppm.
+        offsets: frequency offsets of the data, ppm; None for `framework.spectra.offsets.OFFSETS`.
     """
 
     bibtex = "levenberg1944method"

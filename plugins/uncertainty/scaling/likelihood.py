@@ -27,8 +27,8 @@ class Minimum(NamedTuple):
     Attributes:
         point: position of the minimum within the bounds, float64.
         value: value at the minimum, never above the value at the start.
-        active: for each parameter, -1 if it is at its lower bound, 1 if it is at its upper bound, and 0 otherwise. A
-            bound counts only if the minimised sum would be lower beyond it.
+        active: for each parameter, -1 at its lower bound, 1 at its upper bound, and 0 otherwise. A bound counts only if
+            the minimised sum would be lower beyond this bound.
     """
 
     point: Float[Tensor, "n"]
@@ -49,7 +49,7 @@ def minimise(
     Only the autograd graph of one term is in memory at a time.
 
     Args:
-        terms: the terms of the sum.
+        terms: differentiable functions of the point, whose values are added.
         start: first point, within the bounds.
         lower: lower bounds.
         upper: upper bounds.

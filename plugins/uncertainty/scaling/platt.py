@@ -92,14 +92,14 @@ class Platt(Uncertainty):
 def fit(
     log_prob: Float[Tensor, "sample label"], label: Int[Tensor, "sample"], *, smoothing: bool
 ) -> tuple[float, Float[Tensor, "label"]]:
-    """Return the slope and the biases with the smallest mean cross-entropy to the (smoothed) labels (eq. 2.19).
+    """Return the slope and the biases with the smallest mean cross-entropy to the labels (thesis eq. 2.19).
 
     The problem is convex.
 
     Args:
         log_prob: log-probabilities of the classes, nats, float64.
         label: true class of each sample.
-        smoothing: whether the labels are smoothed, as in `Platt`.
+        smoothing: whether to smooth the labels first, as if there were one more sample of each class (`targets`).
     """
     classes = log_prob.shape[-1]
     wanted = targets(label, classes, smoothing=smoothing)

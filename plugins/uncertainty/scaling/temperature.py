@@ -80,8 +80,8 @@ def fit(predicted: Sequence[Distribution], batches: Sequence[Batch], lower: floa
     """Return the temperature T in [lower, upper] with the smallest mean negative log-likelihood.
 
     If no temperature is better than 1, the result is 1. The negative log-likelihood of a target y is -log p(y)^(1/T) +
-    log Z with the normalising constant Z of p^(1/T) (eq. 2.19). Targets of probability 0 have probability 0 at any T:
-    they are left out, and their number is logged.
+    log Z with the normalising constant Z of p^(1/T) (thesis eq. 2.19). Targets of probability 0 have probability 0 at
+    any T: they are left out, and their number is logged.
 
     Args:
         predicted: densities of each batch.

@@ -111,7 +111,7 @@ class Swag(Uncertainty, FollowsTraining):
             self.next_epoch.fill_(epoch + 1)
 
     def forward(self, inputs: Tensor) -> Distribution:
-        """Return the density of the model in training and without moments, and the mixture otherwise."""
+        """Return the model's density in training and before the first collected epoch, and the mixture otherwise."""
         if self.samples < 1:
             raise ConfigError(f"uncertainty.swag.samples is {self.samples}, expected 1 or more.")
         draws = [] if self.training else self._draws()

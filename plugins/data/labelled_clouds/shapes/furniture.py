@@ -176,10 +176,10 @@ def back(random: Random, width: float, height: float, tall: float, y: float, bar
     Args:
         random: Source of all random numbers.
         width: Width of the back.
-        height: Height of its lower edge.
-        tall: Height of the back itself.
-        y: Position of the back, from the front to the rear.
-        bar: Thickness of its posts.
+        height: Height of the lower edge of the back.
+        tall: Distance of the upper edge from the lower edge.
+        y: Coordinate y of the back; the front of the chair is towards -y.
+        bar: Thickness of the posts of the back.
     """
     lean = random.uniform(0, 12)
     style = random.integers(3)

@@ -16,7 +16,8 @@ def vessel(outer: Sequence[Point], wall: Number, floor: Number, sides: int = 28)
     """Return a vessel of revolution.
 
     Args:
-        outer: Outer profile (radius, height) from the foot to the rim; the inner profile is the same, less the wall.
+        outer: Outer profile (radius, height) from the foot to the rim; the radii of the inner profile are smaller by
+            `wall`.
         wall: Thickness of the wall.
         floor: Height of the floor.
         sides: Number of sides of the polygon that approximates a circle.
