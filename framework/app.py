@@ -147,7 +147,7 @@ def _version() -> str:
 
 
 def page_of(arguments: Sequence[str]) -> str:
-    """Return the page of the documentation that helps after an error of a command."""
+    """Return the address of the documentation page that helps after an error of a command with `arguments`."""
     words = [word.lstrip("+~") for word in arguments]
     return next(
         (page for start, page in PAGES.items() if any(word.startswith(start) for word in words)), FIRST_PAGE

@@ -148,12 +148,12 @@ class Data(ABC):
         """
 
     def check_files(self) -> None:  # noqa: B027 - most data sets have nothing to check
-        """Check in a few seconds, as far as possible, that a user's own files are as `prepare` wants them.
+        """Check, as far as is possible in a few seconds, that `prepare` can read a user's own files.
 
         A sweep calls it before its jobs start. The default checks nothing.
 
         Raises:
-            DataError: as in `prepare`.
+            DataError: a file is missing or wrong; the message says what to do.
         """
 
     @abstractmethod
@@ -199,7 +199,7 @@ class Data(ABC):
         """Return the data that a user gives to a trained model, as a batch: "input", and the fields that `frame` reads.
 
         Raises:
-            DataError: as in `inputs`.
+            DataError: `inputs` refuses `user_data`.
         """
         return {"input": self.inputs(user_data)}
 
@@ -213,7 +213,7 @@ class Data(ABC):
         return None
 
     def preprocessing(self) -> Preprocessing | None:
-        """Return the computation of `inputs` on an array, for `mode=export`; works without `prepare`.
+        """Return the computation by which `inputs` converts an array, for `mode=export`; works without `prepare`.
 
         A data set whose `inputs` changes the numbers of an array (standardises them, for example) overrides this. The
         default, None, means that arrays are the model's inputs as they are.

@@ -218,7 +218,11 @@ class SharedResult(Generic[Computed]):
 class FrozenFrontEnd(Predictor):
     """A predictor and the encoders before it whose features need to be computed only once (`Encoder.fixed`).
 
-    Wrappers around the predictor (several members, many passes) therefore do not compute the features again.
+    Wrappers in the predictor, which have several members or predict several times, do not compute the features again.
+
+    Args:
+        encoders: the fixed encoders, in the order in which they are applied.
+        predictor: the predictor, which reads their features.
     """
 
     def __init__(self, encoders: Sequence[Encoder], predictor: Predictor) -> None:

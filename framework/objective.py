@@ -62,7 +62,7 @@ class Objective(nn.Module, ABC):
 
         Args:
             data: the data set of the run, prepared.
-            config: its config, with every parameter.
+            config: resolved config of the data set.
 
         Raises:
             ConfigError: the objective does not apply to the data.

@@ -20,8 +20,9 @@ class Uncertainty(Predictor):
 
     A constructor takes `model: Callable[[], Predictor]` before `*`. Each call of `model` builds a new, differently
     initialised copy of the wrapped predictor. The returned densities are mixtures of densities (the Mixture of
-    distributions.density), never densities of averaged parameters. Wrapping one member gives that member's numbers to
-    the last bit. Wrappers compose: `uncertainty=[ensemble,temperature]` puts temperature around the ensemble.
+    distributions.density), never densities of averaged parameters. A wrapper with a single member returns the numbers
+    of this member, to the last bit. Wrappers compose: `uncertainty=[ensemble,temperature]` puts temperature around the
+    ensemble.
     """
 
     group: ClassVar[str] = "uncertainty"

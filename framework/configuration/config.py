@@ -46,7 +46,7 @@ class Config:
 
     @classmethod
     def of(cls, values: Mapping[str, Any], folder: Path, overrides: Sequence[str]) -> "Config":
-        """Return the config of a command after checking the settings that belong to no plugin.
+        """Return the config of a command after checking the settings in `values` that belong to no plugin.
 
         Raises:
             ConfigError: A key is unknown, a value is out of range, or a package of a logger is missing.

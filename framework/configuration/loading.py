@@ -72,14 +72,18 @@ class User:
     def convert_inputs(self, model: nn.Module, arguments: tuple[Any]) -> Tensor:
         """Return the model's inputs for a user's data, and store the result of `Data.frame` for `convert_density`.
 
-        This is a forward pre-hook of torch: `arguments` are the arguments of a call of the model, one in number.
+        This is a forward pre-hook of torch: `arguments` holds the only argument of a call of the model, the user's
+        data.
         """
         batch = read_batch(model, self.data, *arguments)
         self.frames[batch["input"]] = self.data.frame(batch)
         return batch["input"]
 
     def convert_density(self, model: nn.Module, inputs: tuple[Tensor], density: Distribution) -> Distribution:
-        """Return the density converted to the user's unit (`Data.frame`), with the names of the target."""
+        """Return `density` converted to the user's unit (`Data.frame`), with the names of the target.
+
+        This is a forward hook of torch: `inputs` holds the inputs that `convert_inputs` returned.
+        """
         frame: Frame | None = self.frames.pop(inputs[0])
         user_density = (
             density if frame is None else AffineDensity(density, *(part.to(inputs[0]) for part in frame))
@@ -96,7 +100,7 @@ def read_batch(model: nn.Module, data: Data, user_data: Any) -> Batch:
     """Return the batch that a model reads for the user's data, in the model's data type and on its device.
 
     Raises:
-        DataError: as in `user_batch`.
+        DataError: The user's data are empty, or the data set refuses them or fails to read them.
     """
     batch = user_batch(data, user_data)
     inputs = batch["input"]
@@ -110,7 +114,7 @@ def user_batch(data: Data, user_data: Any) -> Batch:
     """Return the batch of a data set for the user's data; a path may begin with `~`.
 
     Raises:
-        DataError: The data are empty, or `Data.user_batch` refuses them or fails.
+        DataError: The user's data are empty, or the data set refuses them or fails to read them.
     """
     user_data = _expand_home(user_data)
     if hasattr(user_data, "__len__") and not isinstance(user_data, str) and not len(user_data):
@@ -216,7 +220,11 @@ def read_stored(
 def read_interface(
     described: Mapping[str, Any], path: Path
 ) -> tuple[Target, tuple[int, ...], tuple[str, ...]]:
-    """Return the target, the shape of an input and its columns that the checkpoint `path` describes.
+    """Return the target, the shape of an input and the names of its columns that a checkpoint describes.
+
+    Args:
+        described: Description in the checkpoint, as plain values.
+        path: Path of the checkpoint, for messages.
 
     Raises:
         CheckpointError: The description is invalid.
@@ -255,8 +263,8 @@ def rebuild(description: Description, state: Mapping[str, torch.Tensor]) -> Pred
 def bound_first_prediction(predictor: Predictor, path: str) -> None:
     """Limit the memory of the first prediction of a stored model (`budget.predicting`).
 
-    A prediction that would take far more memory than the sizes of its weights and inputs justify raises an error before
-    the memory is allocated.
+    A prediction that would take far more memory than the sizes of the model's weights and of the inputs justify raises
+    an error before the memory is allocated.
     """
     # a frozen model calls the fixed encoders and the predictor behind them separately
     split = isinstance(predictor, FrozenFrontEnd)
@@ -328,7 +336,11 @@ def require_match(mismatch: str | None, name: str) -> None:
 
 
 def find_checkpoint(run_or_checkpoint: object, *, uri: str | None = None) -> Path:
-    """Return the checkpoint file that a run folder, the path of a file or an MLflow run id stands for.
+    """Return the checkpoint file of a model.
+
+    Args:
+        run_or_checkpoint: Run folder, path of a checkpoint file, or MLflow run id.
+        uri: Tracking store of the run id; None for the local store under `outputs/`.
 
     Raises:
         CheckpointError: There is no checkpoint, or the argument is neither a path nor a name.

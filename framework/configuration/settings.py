@@ -437,6 +437,10 @@ def store_experiment(config: Mapping[str, Any], trained_on: str = "") -> str:
 
     All methods on the same data share one experiment, so that the runs of a sweep over methods appear under their
     parent and can be compared.
+
+    Args:
+        config: Composed config of the run.
+        trained_on: Data set on which the stored model of the command was trained; "" if there is no such model.
     """
     logger = config.get("logger") or {}
     name = config.get("experiment_name")

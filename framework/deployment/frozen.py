@@ -36,12 +36,13 @@ def freeze(
     """Return the deployable form of a trained model.
 
     Args:
-        run_or_checkpoint: run or checkpoint, as in `framework.load`.
-        uri: store, as in `framework.load`.
-        paths: values for the checkpoint's paths, as in `framework.load`.
+        run_or_checkpoint: a run folder, a checkpoint file, or an MLflow run id.
+        uri: tracking store of the run id; None for the local store under `outputs/`.
+        paths: files and folders by their keys in the model's config, such as {"data.root": "/my/data"}.
 
     Raises:
-        CheckpointError, ConfigError: as in `framework.load`.
+        CheckpointError: there is no checkpoint, or it is damaged.
+        ConfigError: the model needs a path that `paths` does not give.
     """
     predictor, description = load_with_description(run_or_checkpoint, uri=uri, paths=paths)
     return Frozen(predictor, description.input_shape, reader(description))

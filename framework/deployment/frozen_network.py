@@ -163,9 +163,14 @@ class Network:
 
 
 def read_network(model: Model, shape: tuple[int, ...]) -> Network | None:
-    """Read a model's encoders and last linear layer as a `Network`; return None if they have layers not in LEAVES.
+    """Read a model's encoders and last linear layer as a `Network`; return None if this is not possible.
 
-    If the head is a softmax of an affine function, the network includes this function.
+    It is possible for encoders of fully connected layers, batch norm, dropout and ReLU (`LEAVES`). If the density of
+    the head is a softmax of an affine function of the raw parameters, the network includes this function.
+
+    Args:
+        model: model in evaluation mode.
+        shape: shape of one input.
     """
     leaves = [part for part in model.encoders.modules() if not list(part.children())]
     first = next(model.parameters(), None)

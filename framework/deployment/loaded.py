@@ -88,7 +88,7 @@ def apply_budget(
         work: Function that computes what the user needs from a prediction; its run time counts.
 
     Raises:
-        ConfigError: As in `load`.
+        ConfigError: The budget is invalid, the model has no knob, no setting meets the budget, or a path is not given.
     """
     from framework.evaluation.budget import meet_budget  # imports the metrics
 

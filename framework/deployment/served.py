@@ -56,7 +56,7 @@ class ServedModel:
         self.predictor, self.description, self.data = predictor, description, data
 
     def predict(self, inputs: Any, params: object = None) -> pd.DataFrame:
-        """Return the table of `predict_table`; MLflow calls this method.
+        """Return the table of `predict_table` for `inputs`; MLflow calls this method, and its `params` are ignored.
 
         Errors are converted to an MlflowException, the only error whose message MLflow's server sends to the client.
         Outside a server, unexpected errors are not converted.

@@ -62,7 +62,8 @@ def measure(
         predict: function to measure, which returns what a user needs, such as the density and the point prediction; it
             is called without gradient.
         inputs: a batch, whose first dimension is the sample, on the device to measure.
-        parameters: number of parameters, which is only copied into the result; None as in `Cost`.
+        parameters: number of parameters, which is copied into the result; None if `predict` does not compute with
+            torch, and FLOPs are not counted then.
         repeats: number of timed calls with the batch, and with a batch of one.
         budget_seconds: if `repeats` calls would take longer than this, fewer calls are timed, but at least three.
 
@@ -115,6 +116,7 @@ def wall_time(
     """Return the median wall time of `call` in seconds, after two warm-up calls.
 
     Up to `repeats` calls are timed. Timing stops earlier when `budget_seconds` are over, but not before the third call.
+    The time of a call ends when `device`, on which it computes, has finished.
     """
     if repeats < 1 or not budget_seconds > 0:
         raise ValueError(

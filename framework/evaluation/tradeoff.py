@@ -130,7 +130,7 @@ def tradeoff(
         predictor: the trained predictor.
         batches: labelled batches on the predictor's device.
         metrics: metrics to compute at each value.
-        knob: name of the knob, as in `knob_owners`.
+        knob: name of the knob of the wrappers or heads; "" if no knob is set, so that the values only name the points.
         values: values of the knob to try.
         reference: value of the knob for the reference, at least the largest of `values` and so large that its own error
             is negligible; None: no comparison with a reference.
@@ -195,7 +195,7 @@ def tradeoff(
 
 
 def average_runs(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Return the mean of each number over the runs and, as "<key>_std", the standard deviation, NaN for one run.
+    """Return the mean of each number over the runs and, as "<key>_std", its standard deviation, NaN for one run.
 
     Standard errors over the samples of a run, "<key>_sem", are left out.
     """
@@ -219,7 +219,8 @@ def run_times(
 
     In every round, each value is timed once, so that a slowdown of the machine affects all values. An untimed call
     precedes each timed call, so that caches filled by another value do not matter. There are `calls` rounds; if these
-    would last longer than `budget_seconds`, there are fewer, but at least three.
+    would last longer than `budget_seconds`, there are fewer, but at least three. The time of a call ends when `device`,
+    on which it computes, has finished.
     """
     times_by_value: list[list[float]] = [[] for _ in values]
     start = perf_counter()

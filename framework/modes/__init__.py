@@ -22,7 +22,12 @@ from framework.training.process_count import require_processes
 
 
 def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float | None:
-    """Run the chosen mode with the composed config; return the value that a sweeper minimises, if the mode has one.
+    """Run the mode that a composed config chooses; return the number that a sweeper minimises, None without one.
+
+    Args:
+        values: Composed config.
+        folder: Folder of the run.
+        overrides: Overrides on the command line.
 
     Raises:
         ConfigError: The mode is unknown, or the config has a fault.

@@ -99,7 +99,7 @@ def wrap_trained(
         predictor: Trained predictor.
         wrappers: Configs of the wrappers, innermost first.
         target: Target that is predicted.
-        inputs: Inputs of a few samples.
+        inputs: Inputs of a few samples, for which the predictor inside each wrapper predicts once.
 
     Raises:
         ConfigError: A wrapper needs more than one model, has weights of its own to train, or would drop the conformal

@@ -237,7 +237,12 @@ def data_of(shards: Shards, config: Config) -> Mapping[str, Any] | None:
 
 
 def require_task(options: EncodeOptions, encoders: Sequence[Any], shards: Shards | None) -> None:
-    """Require that a command either encodes, or packs files.
+    """Require that a command either encodes samples, or packs files into shards.
+
+    Args:
+        options: Options of the mode.
+        encoders: Chosen encoders.
+        shards: Shards that the command reads; None if it reads other files.
 
     Raises:
         ConfigError: There is no encoder; or the command packs, and has an encoder or reads shards.
@@ -260,7 +265,7 @@ def require_task(options: EncodeOptions, encoders: Sequence[Any], shards: Shards
 
 
 def require_apart(root: Path, into: Path) -> None:
-    """Refuse a folder for the features that lies inside the folder of the files.
+    """Refuse a folder for the features (`into`) that lies inside the folder of the files (`root`).
 
     Raises:
         ConfigError: The folder for the features lies inside the folder of the files.
@@ -304,7 +309,11 @@ def collect_files(root: Path) -> list[Path]:
 
 
 def describe(collection: Collection, config: Mapping[str, Any]) -> None:
-    """Write the description of the stored features into their folder, or check it against an existing description.
+    """Write the description of the stored features into their folder; if there is one already, check that it is equal.
+
+    Args:
+        collection: Samples and the folder of the features.
+        config: Resolved configs of the data set and of the encoders.
 
     Raises:
         ConfigError: The folder contains features of other input files, or features that were made with other settings.
@@ -391,6 +400,11 @@ def build_encoders(
     parts: Sequence[Mapping[str, Any]], shape: tuple[int, ...], columns: tuple[str, ...]
 ) -> list[Encoder]:
     """Return the encoders, each built for the features that the encoder before it returns.
+
+    Args:
+        parts: Resolved configs of the encoders, in the order in which they are applied.
+        shape: Shape of one input.
+        columns: Names of the numbers in the last dimension of an input; () if they have none.
 
     Raises:
         ConfigError: An encoder is trained, or uses random numbers.

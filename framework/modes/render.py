@@ -127,8 +127,8 @@ class Scenes:
         synthetic: whether the scenes were generated.
         ground: background of the images.
         source: files, or the data set.
-        surface: kind of the surfaces of a data set.
-        batches: batches of a data set; None for files.
+        surface: which of a data set's `HasScenes.surfaces` is drawn; "" for files.
+        batches: batches of the data set; None for files.
     """
 
     title: str

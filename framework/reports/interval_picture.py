@@ -21,7 +21,7 @@ class Intervals(NamedTuple):
         name: name of the number.
         probability: the stated probability of the intervals.
         low: lower ends; minus infinity for an interval without one, and NaN for an empty interval.
-        high: upper ends; infinity or NaN as for `low`.
+        high: upper ends; infinity for an interval without one, and NaN for an empty interval.
         point: point predictions.
         truth: true values.
     """

@@ -34,7 +34,8 @@ for (const head of document.querySelectorAll("th")) head.addEventListener("click
 def page(title: str, sections: Iterable[tuple[str, str]], *, introduction: str = "") -> str:
     """Return a page as HTML.
 
-    Its content security policy forbids a browser to load anything, so that it shows the same wherever it is opened.
+    The page's content security policy forbids a browser to load anything, so that the page shows the same wherever it
+    is opened.
 
     Args:
         title: title, as plain text.
@@ -58,7 +59,13 @@ def wide(table: str) -> str:
 
 
 def plain_table(heads: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "") -> str:
-    """Return a table of texts as HTML."""
+    """Return a table of plain texts as HTML.
+
+    Args:
+        heads: headings of the columns.
+        rows: cells of each row.
+        caption: text above the table; "" for none.
+    """
     head = "".join(f"<th>{escape(text)}</th>" for text in heads)
     body = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>\n" for row in rows)
     note = f"<caption>{escape(caption)}</caption>" if caption else ""
@@ -66,7 +73,7 @@ def plain_table(heads: Sequence[str], rows: Iterable[Sequence[str]], caption: st
 
 
 def picture(png: bytes, description: str) -> str:
-    """Return a PNG image, embedded, as HTML."""
+    """Return HTML that contains a PNG image, with the text `description` for readers who cannot see the image."""
     return f'<img alt="{escape(description)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
 
 
@@ -81,5 +88,8 @@ def preformatted(text: str) -> str:
 
 
 def folded(summary: str, content: str, *, opened: bool = False) -> str:
-    """Return HTML that shows the plain text `summary`, and after a click on it also the HTML `content`."""
+    """Return HTML that shows the plain text `summary`, and after a click on it also the HTML `content`.
+
+    If `opened` is True, `content` is shown from the beginning.
+    """
     return f"<details{' open' if opened else ''}><summary>{escape(summary)}</summary>\n{content}</details>\n"

@@ -91,7 +91,7 @@ def _save_pictures(run: Run, session: Session, evaluation: Evaluation, synthetic
 
 
 def save_metric_figures(run: Run, evaluation: Evaluation, title: str, *, synthetic: bool) -> None:
-    """Save the figures of the metrics that have one."""
+    """Save the figure of each metric that has one (`HasFigure`) in the run folder."""
     if not evaluation.metrics:  # frames without true images need no metric, and so no torchmetrics
         return
     from framework.metric import HasFigure
@@ -198,7 +198,10 @@ def report_training(run: Run, session: Session, *, kept_epoch: int) -> None:
 
 
 def save_picture(run: Run, figure: "Figure", name: str) -> Path:
-    """Save a figure in the run folder, in the format of the settings, log it to the store, and return its path."""
+    """Save a figure in the run folder, in the format of the settings, log it to the store, and return its path.
+
+    `name` is the name of the file without a suffix.
+    """
     from framework.figures.style import save_figure
 
     folder = run.folder / "figures"

@@ -41,7 +41,7 @@ def list_files(path: Path) -> tuple[list[Path], list[Path]]:
 
 
 def readable(data: Data, file: Path) -> bool:
-    """Return whether every sample of a file can be read."""
+    """Return whether the data set can read every sample of a file."""
     try:
         dataset = data.read([file])
         for index in range(len(dataset)):  # type: ignore[arg-type]

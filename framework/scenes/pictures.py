@@ -90,7 +90,7 @@ def corner_normals(vertices: NDArray, faces: NDArray) -> Float[np.ndarray, "corn
     """Return smooth normals, one for each corner of each face.
 
     Each normal is the area-weighted mean of the normals of the faces at this corner. A face counts only if the angle
-    between it and the corner's own face is below the crease angle.
+    between it and the corner's own face is below 40° (`CREASE`), so that sharp edges stay sharp.
 
     Args:
         vertices: (vertices, 3).

@@ -107,7 +107,7 @@ def look_at(
 
 
 def rotate_camera(camera: Camera, centre: Float[Tensor, "3"], up: Axis, angle: float) -> Camera:
-    """Return the camera moved around the vertical axis through `centre` by `angle` radians towards larger azimuth."""
+    """Return the camera moved by `angle` radians around the axis `up` through `centre`, towards larger azimuth."""
     vertical = UPRIGHT[up]
     rotation_about_vertical = vertical.T @ about_z(torch.tensor(-angle, dtype=torch.float64)) @ vertical
     rotation = camera.rotation.double()
@@ -116,7 +116,10 @@ def rotate_camera(camera: Camera, centre: Float[Tensor, "3"], up: Axis, angle: f
 
 
 def circle_cameras(camera: Camera, centre: Float[Tensor, "3"], up: Axis, count: int) -> Iterator[Camera]:
-    """Yield `count` cameras at equal steps on a full circle around the subject; the first is `camera` itself."""
+    """Yield `count` cameras at equal steps on a full circle; the first is `camera` itself.
+
+    The axis of the circle has the direction `up` and passes through `centre`.
+    """
     for number in range(count):
         yield rotate_camera(camera, centre, up, 2 * math.pi * number / count) if number else camera
 

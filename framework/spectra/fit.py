@@ -167,7 +167,7 @@ def _careful_root(
 def density(
     fitted: Fit, target_count: int, shape: torch.Size | tuple[int, ...], zero: Tensor
 ) -> Distribution:
-    """Return the Gaussian density of the first `target_count` parameters, with batch_shape `shape`.
+    """Return the Gaussian density of the first `target_count` parameters in `fitted`, with batch_shape `shape`.
 
     `zero` (*shape, 1) is added to the mean. It holds zeros that have the dtype, the device and the gradient of the
     head's input. The factor of the marginal covariance consists of the first rows and columns of the lower Cholesky

@@ -46,7 +46,7 @@ def map_npy(path: Path) -> NDArray:
     be shortened while the array is in use.
 
     Raises:
-        ValueError: As `read_npy`.
+        ValueError: The file is no .npy file, is damaged, or contains Python objects or records.
         DataError: The file is a link or no regular file (`framework.storage.enclosed`).
         OSError: The file cannot be opened.
     """

@@ -80,7 +80,7 @@ class Budget(TorchDispatchMode):
 
 
 def building(path: str, weights: Iterable[Tensor]) -> Budget:
-    """Return the budget for building a model and copying `weights`, the stored weights, into it."""
+    """Return the budget for building the model of the checkpoint `path`, and copying its weights `weights` into it."""
     tensors = list(weights)
     return Budget(
         path,
@@ -90,7 +90,7 @@ def building(path: str, weights: Iterable[Tensor]) -> Budget:
 
 
 def predicting(path: str, weights: Iterable[Tensor], inputs: Tensor) -> Budget:
-    """Return the budget for the prediction of a model with the weights `weights` from `inputs`."""
+    """Return the budget for one prediction from `inputs` by the model of the checkpoint `path` with these weights."""
     accounted = stored_bytes(weights) + inputs.numel() * max(inputs.element_size(), 4)
     rows = len(inputs) if inputs.dim() else 1
     most = limits.PREDICTING_BYTES + limits.PREDICTING_ROW * rows + limits.PREDICTING_TIMES * accounted
@@ -107,7 +107,7 @@ def stored_bytes(tensors: Iterable[Tensor]) -> int:
 
 
 def result_bytes(func: Any, args: tuple[Any, ...], keywords: Mapping[str, Any]) -> int:
-    """Return the bytes that an operation will allocate for its result.
+    """Return the bytes that the operation `func` of torch will allocate for its result.
 
     For an operation without a formula, this is the number of bytes of its arguments. The result of such an operation is
     not larger than its arguments, or its shape depends on the values of the arguments and is not known before.

@@ -89,7 +89,15 @@ class Work:
 def track_progress(
     items: Iterable[Item], name: str, total: int, units: str, size: Callable[[Item], int] = lambda _: 1
 ) -> Iterator[Item]:
-    """Yield the items and report progress as the consumer takes them; `size` returns the number of units of an item."""
+    """Yield the items, and report progress as the consumer takes them.
+
+    Args:
+        items: Items of the work.
+        name: Name of the work, such as "testing".
+        total: Number of units of all items.
+        units: Name of the units, such as "samples".
+        size: Function that returns the number of units of an item.
+    """
     with Work(name, total, units) as work:
         for item in items:
             yield item

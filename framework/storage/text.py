@@ -253,7 +253,7 @@ def _with_unit(word: str) -> Suggestion | None:
 
 
 def line_of_word(text: str, number: int) -> int:
-    """Return the number (from 1) of the line that contains the word with the index `number` (from 0)."""
+    """Return the number, from 1, of the line of `text` that contains the word with the index `number`, from 0."""
     line = 1
     for line, words in enumerate(re.split(r"\r\n|\r|\n", text), 1):
         number -= len(words_of(words))

@@ -81,7 +81,14 @@ a lock that is held until the last process of the job has ended.
 
 
 class SeparateProcess(LocalProcess):
-    """Job in a new Python process; an implementation of `Process` whose constructor is a `Starter`."""
+    """Job in a new Python process; an implementation of `Process` whose constructor is a `Starter`.
+
+    Args:
+        command: Command of the job.
+        environment: Environment variables of the job.
+        console: Descriptor of the file that receives the job's output.
+        lock: Descriptor of a lock that is held until the last process of the job has ended.
+    """
 
     def __init__(
         self, command: Sequence[str], environment: Mapping[str, str], console: int, lock: int

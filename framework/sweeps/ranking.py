@@ -229,7 +229,7 @@ def write_results(folder: Path, name: str, ranking: Ranking, keys: Sequence[str]
 
 
 def close_ranking(folder: Path, summary: str, config: Mapping[str, Any]) -> None:
-    """Log the files of a search to its parent run, and close the run, as `comparison.close_parent` does.
+    """Log the files of a search to its parent run in the tracking store, and close the run; do nothing without one.
 
     Args:
         folder: Folder of the search.

@@ -30,7 +30,14 @@ _log = logging.getLogger(__name__)
 
 
 class RaySettings(BaseModel):
-    """Cluster, and resources of each job, as Ray names them."""
+    """Cluster, and resources of each job, as Ray names them.
+
+    Attributes:
+        address: Address of the head node, host:port; None: a cluster on this machine for the time of the sweep.
+        cpus: CPUs of each job.
+        gpus: GPUs of each job, such as 1 or 0.5.
+        resources: Other resources of the cluster that each job needs, such as {"a100": 1}.
+    """
 
     model_config = ConfigDict(extra="forbid")
     address: str | None = None

@@ -50,7 +50,20 @@ _log = logging.getLogger(__name__)
 
 
 class SlurmSettings(BaseModel):
-    """Resources of each job, as SLURM names them."""
+    """Resources of each job, as SLURM names them.
+
+    Attributes:
+        partition: Partition of the jobs; None: the cluster's default.
+        time: Time limit, minutes; a job that reaches it is queued again, and resumes from its checkpoint.
+        cpus: Cores of each task.
+        gpus: GPUs of each node.
+        mem: Memory of each node, GiB; None: the cluster's default.
+        nodes: Nodes of each job.
+        tasks_per_node: Processes on each node.
+        requeues: Number of times that a job is queued again at its time limit.
+        warning: Seconds before the time limit at which a job stops and stores its checkpoint.
+        extra: Other options of sbatch by name, such as {"account": "vision"}.
+    """
 
     model_config = ConfigDict(extra="forbid")
     partition: str | None = None

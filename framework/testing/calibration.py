@@ -106,7 +106,7 @@ class Calibration:
     def no_harm(self, worst: Worst) -> None:
         """Check that calibration does not lower the mean log-likelihood of the validation samples or of new samples.
 
-        The error is the mean decrease divided by its standard error, to which 1e-3 nats are added.
+        The error is the mean decrease, divided by the sum of its standard error and 1e-3 nats.
         """
         for confidence, spread in SPREADS.items():
             validation, fresh = (self.draw_batch(self.target, ROWS, spread, number) for number in (1, 2))

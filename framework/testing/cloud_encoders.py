@@ -28,7 +28,13 @@ def different_clouds(points: int, columns: int) -> list[Tensor]:
 
 
 def batch_of(lengths: Sequence[int], columns: int = 3, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Return padded clouds with these numbers of points, far from the origin, equal in every dtype up to rounding."""
+    """Return padded random clouds, far from the origin, which are equal in every dtype up to rounding.
+
+    Args:
+        lengths: Number of points of each cloud.
+        columns: Number of columns of each cloud.
+        dtype: Type of the result.
+    """
     generator = torch.Generator().manual_seed(0)
     clouds = [torch.randn(length, columns, generator=generator, dtype=torch.float64) for length in lengths]
     return pad([cloud.to(dtype) * 30 + 7 for cloud in clouds])

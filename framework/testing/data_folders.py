@@ -200,7 +200,7 @@ def damage(file: Path, kind: Damage) -> None:
 
 
 def first_match(folder: Path, pattern: str) -> Path:
-    """Return the first file, in order of names, that matches a glob pattern.
+    """Return the first file in `folder`, in order of names, that matches the glob pattern `pattern`.
 
     Raises:
         ValueError: No file matches the pattern.

@@ -373,8 +373,8 @@ def draws_are_independent(density: Distribution, worst: Worst) -> None:
 def periodic(density: Distribution, worst: Worst) -> None:
     """Check that log_prob is the same after up to a thousand turns.
 
-    The error is divided by the rounding error that must be expected, since 2π is not exact in floating point: |log p|
-    (at least 1) plus the gradient of log p, times 1 plus the largest angle.
+    The error is divided by a measure of the rounding error that must be expected, since 2π is not exact in floating
+    point: (max(1, |log p|) + Σ|∂log p/∂φ|) · (1 + max|φ|) for the angles φ.
     """
     generator = torch.Generator().manual_seed(SEED)
     shape = torch.Size((8, *density.batch_shape, *density.event_shape))

@@ -286,7 +286,10 @@ def _perform(mode: OneDevice, call: Callable[[], Any]) -> None:
 
 
 def tensors_in(value: Any, depth: int = 0) -> Iterator[Tensor]:
-    """Yield every tensor in a value, and in lists, tuples, sets and dictionaries nested up to 4 levels deep."""
+    """Yield every tensor in a value, and in lists, tuples, sets and dictionaries nested up to 4 levels deep.
+
+    `depth` is the number of containers around `value`.
+    """
     if isinstance(value, Tensor):
         yield value
     elif depth < 4 and isinstance(value, (list, tuple, set)):

@@ -107,7 +107,13 @@ def density_at(density: Distribution, points: Tensor) -> Tensor:
 
 
 def count_samples(density: Distribution, borders: list[Tensor], samples: Tensor) -> Tensor:
-    """Return the number of samples (draws, *batch, *event) in each cell, (*cells, *batch) float64."""
+    """Return the number of samples in each cell, (*cells, *batch) float64.
+
+    Args:
+        density: Density from which the samples were drawn.
+        borders: Borders of the cells along each number, as `cells` returns them.
+        samples: Samples, (draws, *batch, *event).
+    """
     batch = density.batch_shape
     if density.event_shape == ():
         labels = torch.arange(len(borders[0]) - 1).reshape(-1, *(1,) * samples.dim())
@@ -125,10 +131,19 @@ def count_samples(density: Distribution, borders: list[Tensor], samples: Tensor)
 
 
 def side(density: Distribution, index: int, points: int, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return nodes (points,), weights (points,) and borders of cells (count + 1,) along one number of the density.
+    """Return the nodes and weights of a quadrature along one number of the density, and borders of cells.
 
     Nodes over a whole turn are equally spaced. A range that is shorter than a turn has Gauss-Legendre nodes in each
     cell, since the density may differ at its two ends.
+
+    Args:
+        density: Density of real numbers or angles.
+        index: Position of the number in the target.
+        points: Number of nodes.
+        count: Number of cells.
+
+    Returns:
+        Nodes (points,), weights (points,) and borders of the cells (count + 1,), ascending.
     """
     middle = (torch.arange(points, dtype=torch.float64) + 0.5) / points
     border = torch.arange(count + 1, dtype=torch.float64) / count

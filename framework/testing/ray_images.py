@@ -104,6 +104,11 @@ def crossing(size: tuple[int, int] = (45, 141), count: int = 40, channels: int =
 
     The invisible triangles are behind the camera, outside the image or without area. The vertices are in random order,
     and one of them belongs to no face.
+
+    Args:
+        size: Height and width of the image, pixels.
+        count: Number of triangles.
+        channels: Number of colour channels.
     """
     generator = torch.Generator().manual_seed(SEED)
     view = camera(size)

@@ -10,7 +10,7 @@ from framework.testing.finding import SEED
 
 
 def damaged_copies(content: bytes, count: int) -> Iterator[bytes]:
-    """Yield copies of the bytes of a file, in each of which up to three bytes are replaced at random."""
+    """Yield `count` copies of the bytes of a file, in each of which up to three bytes are replaced at random."""
     random = np.random.default_rng(0)
     for _ in range(count):
         damaged = np.frombuffer(content, np.uint8).copy()
@@ -42,7 +42,7 @@ def images(folder: Path) -> Sequence[Path]:
 def surface(number: int, side: int = 6) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (side², 3) and triangles (face, 3) of a rough surface away from the origin.
 
-    `number` selects the seed of the surface.
+    `number` selects the seed of the surface, and `side` is the number of vertices along one side.
     """
     random = np.random.default_rng([SEED, number])
     row, column = np.divmod(np.arange(side**2), side)

@@ -47,7 +47,7 @@ def describe(content: Entry, parts: Sequence[NDArray | bytes]) -> tuple[Entry, b
 
 
 def glb(content: Entry, parts: Sequence[NDArray | bytes]) -> bytes:
-    """Return the bytes of a .glb file with the given description and binary parts."""
+    """Return the bytes of a .glb file; `content` is its description and `parts` its binary parts, as in `describe`."""
     description, binary = describe(content, parts)
     return pack_glb(json.dumps(description).encode(), binary)
 
@@ -69,7 +69,7 @@ def pack_glb(text: bytes, binary: bytes) -> bytes:
 
 
 def gltf(content: Entry, parts: Sequence[NDArray | bytes]) -> bytes:
-    """Return the bytes of a .gltf file with its binary part in base64."""
+    """Return the bytes of a .gltf file with the binary part in base64; `content` and `parts` are as in `describe`."""
     description, binary = describe(content, parts)
     description["buffers"][0]["uri"] = (
         "data:application/octet-stream;base64," + base64.b64encode(binary).decode()

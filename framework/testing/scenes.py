@@ -14,7 +14,12 @@ SIZE = (48, 64)
 
 
 def sphere(rings: int = 24, radius: float = 1.0) -> Scene:
-    """Return a sphere about the origin, coloured by position, with a camera at a distance of four metres."""
+    """Return a sphere about the origin, coloured by position, with a camera at a distance of four metres.
+
+    Args:
+        rings: Number of rings of faces from pole to pole.
+        radius: Radius, metres.
+    """
     theta = torch.linspace(0, math.pi, rings + 1, dtype=torch.float64)
     phi = torch.arange(2 * rings, dtype=torch.float64) * (math.pi / rings)
     grid = torch.stack(
@@ -40,7 +45,12 @@ def camera() -> Camera:
 
 
 def square(distance: float, side: float = 10.0) -> Scene:
-    """Return a square of two triangles that faces the camera at a distance of `distance` metres."""
+    """Return a square of two triangles that faces the camera.
+
+    Args:
+        distance: Distance from the camera, metres.
+        side: Length of a side, metres.
+    """
     view = camera()
     corners = torch.tensor([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]).double() * side / 2
     corners[:, 2] = distance

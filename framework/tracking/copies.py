@@ -72,7 +72,12 @@ class Copy(ABC):
 
     @abstractmethod
     def close(self, status: Status, journal: Journal) -> None:
-        """Write what is missing, and close the files; `journal` holds all numbers of the run."""
+        """Write the numbers that are still missing, and close the files.
+
+        Args:
+            status: Status with which the run ended.
+            journal: Journal with all numbers of the run.
+        """
 
 
 @final

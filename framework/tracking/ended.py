@@ -87,7 +87,12 @@ def mark_dead(folder: Path, status: Status = "KILLED", uri: str | None = None, *
 def close_and_send(folder: Path, uri: str | None = None) -> None:
     """Close a run as `mark_dead` does, or send the lines that the store lacks if the run is already closed.
 
-    A run that the watcher (`watch`) has closed is closed in its folder only, so its store lacks the status.
+    A run that the watcher (`framework.tracking.watch`) has closed is closed in its folder only, so its store lacks the
+    status.
+
+    Args:
+        folder: Folder of the run; it may come from an untrusted source.
+        uri: Address of the store that the user names (`stores.confirm_address`).
 
     Raises:
         DataError: The process is alive, or the folder contains links.

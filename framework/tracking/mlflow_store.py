@@ -124,7 +124,10 @@ class MlflowStore(Store):
             self._params |= {param.key: param.value for param in params}
 
     def send_file(self, path: str, place: str) -> None:
-        """Store a file or directory; skip it with a warning if it is missing or leads out of the run folder."""
+        """Store the file or directory `path` in the folder `place`; skip it with a warning if it may not be sent.
+
+        It may not be sent if it is missing, or if it leads out of the run folder.
+        """
         file = self._folder / path
         # a journal may come from an untrusted source, so files outside the run folder must not be sent
         try:

@@ -148,6 +148,10 @@ def artifact_folder(uri: str, folder: Path) -> str | None:
     """Return the folder for the files of a new experiment; None for servers, which choose the folder themselves.
 
     The path is absolute, since MLflow's own default depends on the working directory.
+
+    Args:
+        uri: Address of the store.
+        folder: Folder of the run.
     """
     path = sqlite_path(uri)
     if path is None and uri.startswith(("http", "databricks")):

@@ -233,7 +233,7 @@ def _end_at_second(number: int, frame: FrameType | None) -> None:
 
 
 def collate_with_targets(target: Target, items: Mapping[str, Tensor] | list[Batch]) -> Batch:
-    """Return samples as a batch (see `as_batch`) whose targets were checked by `require_targets`."""
+    """Return samples as a batch (`as_batch`), after `require_targets` has compared its targets with `target`."""
     return require_targets(as_batch(items), target)
 
 

@@ -196,7 +196,7 @@ class Training(pl.LightningModule):
         return rank_share(len(batch["index"]), self.device) if self.trainer.world_size > 1 else None
 
     def on_validation_batch_start(self, batch: Batch, batch_index: int, dataloader_idx: int = 0) -> None:
-        """Seed the noise of a validation batch by (seed, batch)."""
+        """Seed the noise of a validation batch by the seed and the number of the batch."""
         seed_step(self.seed, batch_index, "validation")
 
     def validation_step(self, batch: Batch, batch_index: int) -> None:

@@ -38,7 +38,12 @@ _PAUSE = 0.1
 
 @final
 class RankStopped(Stopped):
-    """Exception of this rank if another rank was killed, or was stopped by a signal that this rank did not receive."""
+    """Exception of this rank if another rank was killed, or was stopped by a signal that this rank did not receive.
+
+    Args:
+        rank: Number of the other rank.
+        number: Number of the signal.
+    """
 
     def __init__(self, rank: int, number: int) -> None:
         super().__init__(number)

@@ -92,7 +92,13 @@ class Plateau:
 
 
 def update_plateaus(schedules: Any, loss: float, epochs: int) -> None:
-    """Record the validation loss in the `Plateau` schedules of a `LambdaLR`, and set the rates for the next step."""
+    """Record a validation loss in the `Plateau` schedules of a `LambdaLR`, and set the rates for the next step.
+
+    Args:
+        schedules: a `LambdaLR`; nothing is done for an object of another class.
+        loss: validation loss.
+        epochs: number of epochs after which it was measured.
+    """
     if not isinstance(schedules, LambdaLR):
         return
     plateaus = [factor for factor in schedules.lr_lambdas if isinstance(factor, Plateau)]

@@ -178,7 +178,12 @@ class Model:
 
 
 def load(folder: str | Path = Path(__file__).parent, threads: int = 1) -> Model:
-    """Return the exported model in `folder`; by default the folder of this file."""
+    """Return the exported model in `folder`; by default the folder of this file.
+
+    Args:
+        folder: folder that `mode=export` wrote.
+        threads: number of processor threads of a prediction.
+    """
     return Model(folder, threads)
 
 
