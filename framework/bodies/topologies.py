@@ -190,8 +190,9 @@ def body_in_topology(body: Body, surface: Sheet, mesh: Topology) -> Body:
     """Return a body model whose vertices are those of the topology `mesh`; it has no texture coordinates.
 
     `surface` is the sheet of the topology. A vertex of the body keeps its template position, its displacements by shape
-    and its skinning weights. A new vertex, at the midpoint of an edge, has the means over both ends of the edge. Where
-    the pose bends the surface, the skinned midpoint is therefore not exactly the middle of the posed edge.
+    and its skinning weights. For a new vertex, at the midpoint of an edge, each of these is the mean over both ends of
+    the edge. Where the pose bends the surface, the skinned midpoint is therefore not exactly the middle of the posed
+    edge.
     """
     parts = {
         part: surface.interpolate(getattr(body, part))[mesh.rows]

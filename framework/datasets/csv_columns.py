@@ -106,7 +106,7 @@ class Writing:
         return self.sign == "." and self.thousands is None and not self.units
 
     def standard(self, cell: str) -> str:
-        """Return the number in a cell as a text that `float` reads; without a number, a text that `float` refuses."""
+        """Return the number in a cell as a text that `float` reads; for other cells, a text that `float` refuses."""
         return self._plain_notation(self.split_unit(cell)[0])
 
     def split_unit(self, cell: str) -> tuple[str, str]:

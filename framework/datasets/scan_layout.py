@@ -90,7 +90,7 @@ class TexturePlaces:
 
 
 class SubjectFolder(ABC):
-    """Base of data sets whose subjects lie in a folder of the layout that this module describes."""
+    """Base of data sets whose subjects lie in a folder with the layout of `framework.datasets.scan_layout`."""
 
     @property
     @abstractmethod
@@ -207,7 +207,8 @@ def read_cameras(file: Path) -> dict[str, Camera]:
     """Return cameras by the names of their views.
 
     Raises:
-        DataError: the file is missing or damaged, a view is named twice, or the numbers of a view make no camera.
+        DataError: the file is missing or damaged, a view is named twice, or the numbers of a view are not those of a
+            camera.
     """
     cameras: dict[str, Camera] = {}
     document = read_json(file, "cameras")
@@ -316,7 +317,7 @@ def read_photograph(view: View) -> Photograph:
 
 
 def read_places(root: Path, topology: str) -> TexturePlaces:
-    """Return the texture coordinates of a topology's triangles.
+    """Return the texture coordinates of the triangles of the topology that is called `topology`.
 
     Raises:
         DataError: the file is missing or damaged, or its arrays do not fit together.

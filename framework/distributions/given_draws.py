@@ -39,7 +39,8 @@ class GivenDraws(TorchFunctionMode):
     are ignored: a density may draw an empty sample to learn its type.
 
     Args:
-        arrays: the arrays; None in place of an array, or of all, stands for random numbers.
+        arrays: the arrays; None in place of one array, or in place of the sequence, means that random numbers are
+            drawn.
     """
 
     def __init__(self, arrays: Sequence[Tensor | None] | None = None) -> None:

@@ -324,9 +324,9 @@ class Region(NamedTuple):
     A highest-density region holds all values at which the density is above some level.
 
     Attributes:
-        low: probability of all values at which the density is higher than at a given value.
-        high: probability of all values at which the density is at least as high as at the given value.
-        size: size of the region with a given probability, in the unit of the target.
+        low: probability of all values at which the density is higher than at the argument `value` of `highest_region`.
+        high: probability of all values at which the density is at least as high as at `value`.
+        size: size of the region with the probability `mass`, an argument of `highest_region`, in the target's unit.
     """
 
     low: Tensor
@@ -342,7 +342,7 @@ def highest_region(
 
     Args:
         density: a density of one number, with batch_shape (*batch).
-        value: the given value of `Region`, (*batch, 1).
+        value: value with whose density the density of all other values is compared (`Region`), (*batch, 1).
         mass: probability of the region whose size is returned, in (0, 1).
         equal: for each dtype of the density (float32, float64), the relative difference up to which two densities
             count as equal, so that rounding has no influence.

@@ -15,7 +15,7 @@ compiled = compiler(kernel_cache("unit_ball", [Path(__file__)]))
 def unit_ball(clouds, counts, normalised, centre, scale):
     """Fill `normalised` with clouds that are normalised to the unit ball (thesis eq. 6.2).
 
-    See `framework.geometry.clouds.normalise_clouds`.
+    The mean of the points is subtracted, and then the coordinates are divided by the largest norm.
 
     Args:
         clouds: (cloud, point, column) float32 or float64.

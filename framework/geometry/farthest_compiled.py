@@ -14,7 +14,9 @@ compiled = compiler(kernel_cache("farthest", [Path(__file__)]))
 @compiled
 @no_type_check
 def farthest(clouds, counts, count):
-    """Return indices (cloud, count), as `framework.geometry.farthest.farthest` defines them.
+    """Return the first `count` indices of each cloud in farthest-point order, (cloud, count).
+
+    `framework.geometry.farthest.farthest` defines this order.
 
     Args:
         clouds: (cloud, point, 3) float64, C-contiguous.

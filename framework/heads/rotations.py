@@ -47,8 +47,8 @@ def grown_matrix(raw: Float[Tensor, "*batch 3 3"], largest: float) -> Float[Tens
 class MatrixHead(DensityHead):
     """Base of heads that read the nine elements of a matrix X, row by row, for one density with a matrix as parameter.
 
-    The parameter is a multiple of X that grows faster than X (`grown_matrix`). The uniform density of rotations is
-    X = 0 and needs no special case.
+    The parameter is a multiple of X that grows faster than X (`grown_matrix`). X = 0 gives the uniform density
+    of rotations, without a special case.
 
     Raises:
         ConfigError: the target is not azimuth, elevation and tilt, in this order.

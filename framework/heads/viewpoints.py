@@ -75,7 +75,8 @@ class MatrixDensity(ViewpointDensity):
     def mode(self) -> Float[Tensor, "*batch 3"]:
         """Viewpoint of the rotation U Vᵀ, at which log p(R) is highest, (*batch, 3).
 
-        This is the mode of the rotation's density: the factor cos e of the viewpoint's density is not included.
+        U S Vᵀ is the proper singular value decomposition of the parameter. The viewpoint is the mode of the density of
+        rotations: the factor cos e of the density of viewpoints is not included.
         """
         return quaternions.to_viewpoint(self.frame.mode).to(self.dtype)
 

@@ -184,7 +184,7 @@ def require_points(points: Tensor, name: str) -> None:
         name: name of the tensor, for the message.
 
     Raises:
-        DataError: shape or dtype is another one.
+        DataError: the shape or the dtype is not one of these.
     """
     if points.dim() != 3 or points.shape[2] != 3 or points.dtype not in (torch.float32, torch.float64):
         raise DataError(

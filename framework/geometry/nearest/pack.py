@@ -49,7 +49,7 @@ FLAT = 1e-30
 
 
 class Packed(NamedTuple):
-    """A packed cloud of at least one point (see the module's description).
+    """A packed cloud of at least one point: a tree whose leaves hold 16 points each.
 
     Attributes:
         points: the leaves in order, each as 16 x, 16 y, 16 z and 16 ids; the last point is repeated to fill the last
@@ -378,9 +378,9 @@ def sort_crowded(points, crowded, crowded_count, cells):
 @compiled
 @no_type_check
 def box_leaves(packed, size, begin, end):
-    """Turn the records of the leaves begin…end into 16 x, 16 y, 16 z and 16 ids, and compute the boxes of these leaves.
+    """Turn the records x y z id of leaves begin…end into 16 x, 16 y, 16 z and 16 ids, and compute the leaves' boxes.
 
-    If the last leaf is among them, it is first filled with copies of the last point.
+    If the last leaf of the cloud is among these leaves, it is first filled with copies of the last point.
 
     Args:
         packed: the packed cloud, whose `points` hold records; changed in place.

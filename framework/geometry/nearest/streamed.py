@@ -82,7 +82,7 @@ class Stream:
     ) -> Bool[Tensor, "query"]:
         """Return a mask of queries for which a point of the new chunk is nearer than all points of earlier chunks.
 
-        It is false for equal distances, so that the lower index stays.
+        The mask is false for equal distances, so that the lower index stays.
 
         Args:
             distance: distance of the nearest point in the new chunk.
