@@ -223,7 +223,7 @@ class Data(ABC):
     def state_dict(self) -> Mapping[str, Any]:
         """Return the state that `inputs` and `read` need in addition to the config, as plain values and tensors.
 
-        The checkpoint of a model that is trained on these data stores it.
+        The state is stored in the checkpoint of a model that is trained on these data.
         """
         return {}
 

@@ -97,7 +97,7 @@ class Fitted(ABC):
     """Additional base class of a density head that is fitted to the whole training split at once, not by gradient.
 
     Trees are an example. No linear layer precedes the head: it reads the features as they are, and its `size` is the
-    number of features, 0 before the fit. The encoders before the head may not have trained parameters either. The
+    number of features, 0 before the fit. The encoders before the head must not have parameters that are trained. The
     head's state may have any shape: `load_state_dict` of a newly built head accepts every stored shape.
     """
 

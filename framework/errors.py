@@ -35,7 +35,7 @@ def escape_unprintable(text: str, allowed: str = "\n\t") -> str:
 def escape_undecodable(text: str) -> str:
     r"""Return a text in which bytes that are not UTF-8, as in names of files, are escaped as \xe9.
 
-    Python represents each of them by a lone surrogate (PEP 383), which no text file, font or database accepts.
+    Python represents each of these bytes by a lone surrogate (PEP 383), which no text file, font or database accepts.
     """
     return re.sub("[\ud800-\udfff]", _written_out, text)
 

@@ -18,7 +18,15 @@ from framework.uncertainty import held_out
 
 
 def nonempty_batches(batches: Iterable[Batch], by: str) -> list[Batch]:
-    """Return the batches that have samples as a list, which the wrapped predictor and the wrapper can read in turn."""
+    """Return the batches that have samples as a list, which the wrapped predictor and the wrapper can both read.
+
+    Args:
+        batches: batches that may be iterated only once.
+        by: name of the wrapper, for the error message.
+
+    Raises:
+        UserError: there is no sample in any batch.
+    """
     nonempty = [batch for batch in batches if len(batch["target"])]
     if not nonempty:
         raise UserError(

@@ -75,8 +75,8 @@ class Exporting:
 
     Attributes:
         predictor: the model, on the CPU, in evaluation mode.
-        description: its description.
-        preprocessing: computation before its first layer, or None.
+        description: description of the model.
+        preprocessing: computation before the model's first layer, or None.
     """
 
     predictor: Predictor

@@ -88,6 +88,12 @@ def errors(log_probs: LogProbs, value: int, seeds: Sequence[int], reference: Ref
     sample. "log_likelihood_nats" is averaged over samples and seeds. The standard errors "<key>_sem" are over the
     seeds, NaN for a single seed. The standard error of a root mean square sqrt(m) is that of m divided by 2 sqrt(m)
     (delta method).
+
+    Args:
+        log_probs: function of a value of the knob and a seed that returns the log-likelihood of each sample.
+        value: value of the knob.
+        seeds: seeds of the random numbers.
+        reference: log-likelihoods at a far more expensive value of the knob, of the same samples.
     """
     per_seed = torch.stack([log_probs(value, seed) for seed in seeds]).double()  # (repeats, samples)
     means = per_seed.mean(1)

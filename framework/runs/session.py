@@ -671,7 +671,7 @@ def require_target(target: Target | None, description: Description) -> None:
 
 
 def calibrate(session: Session) -> None:
-    """Calibrate the session's predictor on the validation split, and print its remarks."""
+    """Calibrate the session's predictor on the validation split, and print the remarks of its wrappers and heads."""
     session.predictor.eval().to(session.device)
     seed_step(session.settings.seed, 0, "calibrate")
     if session.config.mode == "train" and self_training(session.predictor) is not None:

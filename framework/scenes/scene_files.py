@@ -1,6 +1,6 @@
 """Reader of scene files: surfaces, colours and textures.
 
-docs/reference/files.md says why trimesh does not read them.
+docs/reference/files.md says why the package trimesh is not used to read scene files.
 """
 
 import re

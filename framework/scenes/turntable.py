@@ -125,7 +125,10 @@ def circle_cameras(camera: Camera, centre: Float[Tensor, "3"], up: Axis, count: 
 
 
 def read_camera(file: Path) -> Camera:
-    """Read a camera from `K`, `R`, `t`, `size` ([width, height]), as `framework.geometry.camera` defines them.
+    """Read a camera from the entries `K`, `R`, `t` and `size` of a file.
+
+    A point X of the scene is seen at the pixel K (R X + t), divided by its third number (`framework.geometry.camera`).
+    `size` is [width, height], pixels.
 
     Raises:
         DataError: the file is missing or damaged, or one of the four entries is missing or is not valid for a camera.

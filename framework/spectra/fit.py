@@ -34,7 +34,7 @@ class Fit(NamedTuple):
         parameters: (spectrum, p), all fitted parameters.
         root: (spectrum, p, p), lower Cholesky factor of their covariance.
         cost: (spectrum,), half the sum of squared residuals.
-        status: (spectrum,), values of framework.least_squares.solution.Status.
+        status: (spectrum,), how each fit ended, as values of `framework.least_squares.solution.Status`.
     """
 
     parameters: Float[Tensor, "spectrum p"]
@@ -170,8 +170,8 @@ def density(
     """Return the Gaussian density of the first `target_count` parameters in `fitted`, with batch_shape `shape`.
 
     `zero` (*shape, 1) is added to the mean. It holds zeros that have the dtype, the device and the gradient of the
-    head's input. The factor of the marginal covariance consists of the first rows and columns of the lower Cholesky
-    factor.
+    input of the density head that calls this function. The factor of the marginal covariance consists of the first rows
+    and columns of the lower Cholesky factor.
     """
     mean = fitted.parameters[:, :target_count].reshape(*shape, target_count).to(zero) + zero
     return JointNormal(

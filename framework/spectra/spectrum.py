@@ -139,7 +139,8 @@ class Misfit:
         """Return the cost, its gradient, the normal matrix and the number of measured offsets, computed on the CPU.
 
         The cost (batch,) is half the sum of squared residuals r. With their Jacobian J, the gradient (batch, p) is Jᵀr,
-        and the normal matrix (batch, p, p) is JᵀJ. The number of measured offsets is (batch,).
+        and the normal matrix (batch, p, p) is JᵀJ. The number of measured offsets is (batch,). `rows` are the rows of
+        `measured` that belong to the rows of `parameters`.
         """
         gram = parameters.new_empty(*parameters.shape, parameters.shape[1])
         cost, gradient, measured_counts = (
@@ -156,7 +157,8 @@ class Misfit:
     def curvature(self, parameters: Tensor, rows: Tensor) -> Tensor:
         """Return the sum over offsets of the residual times ∇²Z, (batch, p, p), computed on the CPU.
 
-        ∇²Z is the matrix of second derivatives of Z by the parameters.
+        ∇²Z is the matrix of second derivatives of Z by the parameters. `rows` are the rows of `measured` that belong to
+        the rows of `parameters`.
         """
         curvature = parameters.new_empty(*parameters.shape, parameters.shape[1])
         compiled.compute_curvature(*self._arrays(parameters, rows), curvature.numpy())

@@ -244,7 +244,7 @@ class _Queue:
         self._warned = False
 
     def state(self, identity: str, since: float, *, expected: bool) -> Listed | None:
-        """Return the line of a job; None if SLURM does not answer, or has not been asked yet.
+        """Return squeue's line about a job; None if SLURM does not answer, or has not been asked yet.
 
         Args:
             identity: Id of the job.
@@ -278,7 +278,10 @@ QUEUE = _Queue()
 
 
 def job_name(folder: Path) -> str:
-    """Return the name of a job in SLURM, by which a handle in a file is verified."""
+    """Return the name that SLURM has for the job in `folder`.
+
+    The name shows whether the SLURM job whose handle was read from a file is the job in this folder.
+    """
     return f"sweep-{sha256(as_bytes(str(folder))).hexdigest()[:16]}"
 
 

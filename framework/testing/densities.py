@@ -222,7 +222,7 @@ def integral(density: Distribution, worst: Worst) -> None:
     """Check that the density integrates to 1.
 
     A density of one or two numbers or of three angles is integrated by adaptive quadrature. A density of three real
-    numbers is integrated on a grid, whose place and width are those of draws.
+    numbers is integrated on a grid, whose centre and width are determined by draws.
     """
     if density.event_shape in ((1,), (2,)):
         quadrature = boxes(density)
@@ -284,7 +284,8 @@ def samples_follow_log_prob(density: Distribution, worst: Worst) -> None:
 
     χ² is converted to a normal deviate by the formula of Wilson & Hilferty (1931). Draws of one number are counted in
     cells of equal mass from the quadrature, draws of several numbers on a grid. If the numbers are real, further draws
-    determine its place, width and correlation. Cells with an expectation of fewer than five draws are merged into one.
+    determine the centre, the width and the axes of the grid. Cells with an expectation of fewer than five draws are
+    merged into one.
     """
     seed(SEED)
     draws = density.sample(torch.Size((DRAWS,)))

@@ -68,7 +68,7 @@ class HeadSubject:
         return self.raw_parameters(len(sizes)).double() * factors.view(-1, *[1] * len(self.raw_shape))
 
     def values(self, *batch: int) -> Tensor:
-        """Return seeded targets (*batch, *event), as the function `values` does."""
+        """Return seeded targets of the contract row, (*batch, *event)."""
         return values(self.row.target, batch)
 
     def draws(self) -> bool:

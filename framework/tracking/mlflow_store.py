@@ -102,7 +102,7 @@ class MlflowStore(Store):
             require_own_files(self._info.uri, (location or "",))
 
     def send(self, batch: Sequence[Record]) -> None:
-        """Store a batch; MLflow ignores a metric if it has one with the same key, time, step and value already."""
+        """Store a batch; MLflow ignores a metric that it has already, with the same key, time, step and value."""
         if "status" in batch[0]:
             status, end = batch[0]["status"], round(batch[0]["time"] * 1000)
             if status == "RUNNING":
@@ -124,9 +124,9 @@ class MlflowStore(Store):
             self._params |= {param.key: param.value for param in params}
 
     def send_file(self, path: str, place: str) -> None:
-        """Store the file or directory `path` in the folder `place`; skip it with a warning if it may not be sent.
+        """Store the file or directory `path` of the run folder under the folder `place` of the run in the store.
 
-        It may not be sent if it is missing, or if it leads out of the run folder.
+        If it is missing or leads out of the run folder, it is skipped with a warning.
         """
         file = self._folder / path
         # a journal may come from an untrusted source, so files outside the run folder must not be sent

@@ -1,4 +1,4 @@
-"""Schedules of the learning rate: the factor that multiplies it at each optimiser step."""
+"""Schedules of the learning rate: functions that return the factor on the learning rate at each optimiser step."""
 
 import math
 from collections.abc import Callable
@@ -79,7 +79,7 @@ class Plateau:
         self.since = 0
 
     def __call__(self, step: int) -> float:
-        """Return the factor at a step."""
+        """Return the factor that multiplies the learning rate at a step."""
         return warmup_factor(step, self.warmup_steps) * self.factor**self.reductions
 
     def record_loss(self, loss: float, epochs: int) -> None:

@@ -95,7 +95,7 @@ def cast(corners: Float[Tensor, "faces 3 3"], rays: Float[Tensor, "rays 3"], nea
 def cross(first: Float[Tensor, "faces 3"], second: Float[Tensor, "faces 3"]) -> Float[Tensor, "faces 3"]:
     """Return cross products of rows; exchanged arguments give exactly the negative result.
 
-    Two faces beside an edge therefore compute the same number for it, and no ray passes between them.
+    The two faces beside an edge therefore get the same number for this edge, and no ray passes between them.
     """
     a, b, c = first.unbind(-1)
     x, y, z = second.unbind(-1)
