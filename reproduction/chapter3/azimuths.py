@@ -63,7 +63,7 @@ def correlation(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def errors_of_thirds(scores: ImageScores) -> tuple[float, float]:
-    """Return the mean errors of two thirds of the images: those with the lowest and those with the highest entropy.
+    """Return the mean errors of the third of the images with the lowest, and of that with the highest entropy.
 
     Both are NaN if all entropies are equal.
     """

@@ -118,8 +118,8 @@ def evaluate_flights(model: Model, data: Data) -> FlightErrors:
     """Evaluate a model on the test split, with intervals that are calibrated on the validation split.
 
     For each coordinate and frame, the calibrated interval is the middle share of the samples that holds the true value
-    of 90 % of the validation windows (distributional conformal prediction: Chernozhukov, Wüthrich & Zhu 2021). It has
-    the same coverage on the test split if windows are exchangeable.
+    of 90 % of the validation windows (distributional conformal prediction: Chernozhukov, Wüthrich & Zhu 2021). The
+    interval has the same coverage on the test split if windows are exchangeable.
     """
     torch.manual_seed(0)
     metric = FlightError(data.target)

@@ -1,4 +1,4 @@
-"""Measure the quality of a person's image against its run time: meshes with several samples, and trained networks.
+"""Measure the quality of a person's image against its run time, for meshes with several samples per pixel and networks.
 
     python -m reproduction.chapter7.smplpix_work_precision <run> …
 

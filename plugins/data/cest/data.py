@@ -68,7 +68,7 @@ class CEST(Data, Mapped):
     (batch, p), all fitted parameters.
 
     Args:
-        root: A volume in a format of volumes.py, or a folder with brain.npz; None to generate a slice.
+        root: A volume (.mat, .npz, .nii or .nii.gz), or a folder with brain.npz; None to generate a slice.
         preset: "ten": the target is the amplitude and width of five pools. "fifteen": their centres too.
         offsets: Offsets at which the model reads spectra, ppm, ascending; None for `framework.spectra.offsets.OFFSETS`.
             Spectra at other offsets are resampled.

@@ -12,8 +12,8 @@ from plugins.data.pascal3d.shapes import Body
 class Family(NamedTuple):
     """Builder of random objects of a class, and the symmetry of these objects about the vertical axis.
 
-    `symmetry` is n if the objects look the same after a rotation by 360°/n; 1 means no symmetry. It is 0 if they look
-    the same after any rotation.
+    `symmetry` is n if the objects look the same after a rotation by 360°/n; 1 means no symmetry. `symmetry` is 0 if the
+    objects look the same after any rotation.
     """
 
     build: Callable[[Generator], Body]

@@ -33,7 +33,7 @@ class View(NamedTuple):
         azimuth, elevation, tilt: Angles, degrees.
         distance: Distance of the camera from the object's centre, in diagonals of the object.
         focal: Focal length, pixels.
-        principal: Principal point (x, y), pixels, as in `framework.geometry.camera`.
+        principal: Principal point (x, y), pixels from the centre of the first pixel.
     """
 
     azimuth: float

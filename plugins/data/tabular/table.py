@@ -45,7 +45,16 @@ MANY_LABELS = 20
 
 
 class Question(NamedTuple):
-    """Settings that determine how a table is read; names and meanings as for the arguments of `Tabular`."""
+    """Settings that determine how a table is read, from the arguments of `Tabular`.
+
+    Attributes:
+        target: Columns to predict.
+        kind: Kind of the target: class, real number or angle.
+        columns: Columns of the input; None for every other column whose cells are mostly numbers.
+        validation, test: Shares of the rows for these splits, if there is no column `split`.
+        data_seed: Seed of the random splits.
+        missing: Treatment of rows without a number or a label. "error" refuses them, "skip" leaves them out.
+    """
 
     target: tuple[str, ...]
     kind: Kind

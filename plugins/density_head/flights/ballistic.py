@@ -55,10 +55,10 @@ class BallisticHead(DensityHead, Fitted):
     table, and the noise, that make whole training windows most likely. `calibrate` fits one factor for the standard
     deviation of each number.
 
-    The density of the state is N(estimate, (JᵀJ)⁻¹) with the Jacobian J of the residuals. It is propagated to the
-    future: "linearised" gives a normal density. "sampled" gives a mixture with one component for each sampled flight,
-    which can also describe that a ball may hit or miss the edge of the table. Input and target are in metres. The
-    gradient of the density with respect to the input is set to 0.
+    The density of the state is N(estimate, (JᵀJ)⁻¹) with the Jacobian J of the residuals. This density is propagated to
+    the future: "linearised" gives a normal density. "sampled" gives a mixture with one component for each sampled
+    flight, which can also describe that a ball may hit or miss the edge of the table. Input and target are in metres.
+    The gradient of the density with respect to the input is set to 0.
 
     Args:
         observed, step: number of observed frames, and time between frames in seconds; the same values as in the config

@@ -65,8 +65,9 @@ def identify(
     """Return the values of `FITTED` that fit best, the states, and the standard errors of the values.
 
     The search is Levenberg and Marquardt's method. The standard errors are the roots of the diagonal of the inverse
-    Gauss-Newton Hessian in which the states are eliminated. They hold if the model is right and the residuals have the
-    standard deviation `noise`. They are infinite for a constant that no flight determines.
+    Gauss-Newton Hessian in which the states are eliminated. These standard errors hold if the model is right and the
+    residuals have the standard deviation `noise`. The standard error of a constant that no flight determines is
+    infinite.
 
     A flight's state affects no other flight's residuals. So each state is eliminated on its own, and the remaining
     system has as many equations as there are constants (Schur's complement, as in bundle adjustment: Triggs et al.

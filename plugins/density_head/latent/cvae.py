@@ -160,8 +160,8 @@ class CVAEHead(DensityHead):
         tolerance: largest estimated error of log_prob in evaluation, nats; may be set at any time. If it is set,
             log_prob first draws S samples and doubles them until its estimated error is below the tolerance. None: S
             samples.
-        backbones: "shared": prior, encoder and decoder read the features of one network; "each": each reads those of
-            its own network of the same architecture (thesis §3.6.1).
+        backbones: "shared": prior, encoder and decoder read the features of one network; "each": each of the three
+            reads the features of its own network, of the same architecture (thesis §3.6.1).
         component: the head whose densities are mixed.
     """
 

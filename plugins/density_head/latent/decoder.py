@@ -24,9 +24,9 @@ class LatentDecoder(nn.Module):
     Without the two linear paths, the components of a mixture over several numbers may become equal during the training.
     The path from the features shifts all components together. Therefore a property that all components have to learn
     (such as an angle that the image determines) does not favour the component that learns it first. The path from z
-    makes the components differ from the first step on. It also learns a target that points in one of two opposite
-    directions with equal probability. The mean of such a target is 0 and says nothing about the directions, but its
-    second moment does, and the gradient of `spread` depends on the second moment.
+    makes the components differ from the first step on. With this path, the network also learns a target that points in
+    one of two opposite directions with equal probability. The mean of such a target is 0 and says nothing about the
+    directions, but its second moment does, and the gradient of `spread` depends on the second moment.
 
     Args:
         latent: dimensions of z.

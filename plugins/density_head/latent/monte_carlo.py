@@ -73,7 +73,8 @@ class Effort:
     def replicates(self) -> int:
         """Number R of replicates, the independent parts of the samples.
 
-        It is TO_TOLERANCE with a tolerance. Without one, it is the largest number up to REPLICATES that divides S.
+        With a tolerance, R is TO_TOLERANCE. Without a tolerance, R is the largest number up to REPLICATES that divides
+        S.
         """
         if self.tolerance is not None:
             return TO_TOLERANCE

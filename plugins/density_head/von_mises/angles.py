@@ -43,7 +43,8 @@ def half_products(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
 def in_single(value: Tensor, mean: Tensor) -> bool:
     """Return whether to compute in float32 alone.
 
-    This is so if both angles are float32 and their values can be read, which compilers and torch.func do not allow.
+    The result is true if both angles are float32 and no compiler or transform of torch.func prevents reading their
+    values.
     """
     if torch.compiler.is_compiling() or is_transformed():
         return False

@@ -99,9 +99,9 @@ def sample(mean: Tensor, concentration: Tensor) -> Tensor:
     """Return one angle in [-π, π] per element, by rejection (Best & Fisher 1979), computed in float64.
 
     Proposals θ, the distances from the mean, come from a wrapped Cauchy density with the parameter ρ, as in the paper.
-    They are computed by t = tan(θ/2) = (1-ρ)/(1+ρ) tan(πu/2), with u uniform on (-1, 1), and 1 - cos θ = 2t²/(1+t²).
-    With these formulas nothing cancels at any κ. Elements without an accepted proposal after SAMPLING_ROUNDS keep their
-    last proposal, so that the loop always ends.
+    The proposals are computed by t = tan(θ/2) = (1-ρ)/(1+ρ) tan(πu/2), with u uniform on (-1, 1), and 1 - cos θ =
+    2t²/(1+t²). With these formulas nothing cancels at any κ. Elements without an accepted proposal after
+    SAMPLING_ROUNDS keep their last proposal, so that the loop always ends.
     """
     mean, concentration = torch.broadcast_tensors(mean, concentration)
     samples = processor.sample(mean, concentration, BLOCK, SAMPLING_ROUNDS)

@@ -43,7 +43,7 @@ class BPS(Encoder):
             numbers), or the name of a column (1 number).
         normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`).
         basis_seed: seed of "ball_uniform"; the run's seed has no influence.
-        rotation_invariant: encode each cloud along its own axes (`plugins.encoder.bps.frame`).
+        rotation_invariant: whether to encode each cloud along its own axes (`plugins.encoder.bps.frame`).
 
     Raises:
         ConfigError: the input is not a cloud; a feature is named twice or needs a column that the clouds lack; or

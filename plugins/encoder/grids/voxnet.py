@@ -19,7 +19,13 @@ SLOPE = 0.1
 
 @dataclass(frozen=True)
 class Published:
-    """Published settings of a variant of `VoxNet`; the attributes are the arguments of the same names."""
+    """Published settings of a variant of `VoxNet`.
+
+    Attributes:
+        channels: number of outputs of each convolution.
+        widths: number of outputs of each fully connected layer.
+        dropout: probabilities: three in "voxnet", one for each fully connected layer in "conv3d".
+    """
 
     channels: tuple[int, ...]
     widths: tuple[int, ...]

@@ -135,7 +135,11 @@ def mixed_7a() -> Branches:
 
 
 def block8(*, scale: float = 0.20, relu: bool = True) -> Residual:
-    """Return a residual block for 2080 channels; `scale` and `relu` are those of `Residual`."""
+    """Return a residual block for 2080 channels.
+
+    `scale` multiplies the output of the branches before it is added to the input; `relu` says whether the sum is
+    rectified.
+    """
     return Residual(
         2080,
         448,

@@ -11,7 +11,7 @@ def layers(length: int, widths: Sequence[int], slope: float = 0.0) -> nn.Sequent
     Args:
         length: number of inputs of the first layer.
         widths: number of outputs of each layer.
-        slope: slope of the activation for negative numbers; it is LeakyReLU if the slope is not 0.
+        slope: slope of the activation for negative numbers; a slope other than 0 makes the activation LeakyReLU.
     """
     modules: list[nn.Module] = []
     for width in widths:

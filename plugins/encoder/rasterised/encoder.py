@@ -65,7 +65,7 @@ class MeshSettings:
 class Rasterised(Encoder):
     """Rendered image of a registered body with vertex colours or a texture, on white, in the canonical camera.
 
-    Inputs are those of `human_scans`, whose vertices are in the order of the topology. Colours are interpolated and
+    Inputs are the coloured vertices of `data=human_scans`, in the order of the topology. Colours are interpolated and
     averaged in linear RGB. Textures lie in the folder of the data and are read when they are first drawn. Features are
     (3, height, width), sRGB numbers in [0, 1], in the inputs' dtype; with `depth` they are (4, height, width), like
     those of `encoder=projection`. A network can read these features instead of projected points. With `ground` the

@@ -19,8 +19,8 @@ class CRPS(Mean):
 
     `crps` is for real numbers, and `crps_deg` for angles, in degrees. Each number of a target is scored under its
     marginal density. The score of a sample is the mean over its numbers; the mean over samples is reported with its
-    standard error. `crps_<name>` is the score of one number of a target with several. For a point mass, the score is
-    the absolute deviation of the point.
+    standard error. `crps_<name>` is the score of one number of a target with several. If the density is a point mass,
+    the score is the absolute deviation of this point from the target.
 
     If scores are estimated from draws (`score.py`), `crps_mc_error` is the standard error of `crps` that is due to the
     draws only.

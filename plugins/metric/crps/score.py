@@ -40,8 +40,8 @@ def crps(density: Distribution, value: Tensor, samples: int) -> Score:
     X and X' are independent samples of the density, and y is `value`. For an angle, |·| is the angular distance
     (Grimit, Gneiting, Berrocal & Johnson 2006, eq. 5). The score is exact for densities that register a formula
     (`protocol.ranked_score`), for mixtures of up to `MOST` normals, and for angles whose density a grid resolves
-    (`circular_moments`). Otherwise it is the unbiased estimate from `samples`
-    draws, in `REPLICATES` parts whose spread gives the error.
+    (`circular_moments`). Otherwise the score is estimated without bias from `samples` draws, in `REPLICATES` parts
+    whose spread gives the error.
 
     Args:
         density: density of one real number or one angle, event_shape (1,).

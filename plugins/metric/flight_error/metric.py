@@ -28,7 +28,7 @@ class FlightError(Metric, HasFigure):
     - `error_cm`, `error_near_cm`, `error_far_cm`: mean error of the point prediction over all predicted frames, in the
       first predicted frame, and in the last one. The true positions are the batch field "truth" (a simulated flight
       without noise) if there is one, and otherwise the target.
-    - `interval_90`: share of the recorded coordinates within the middle 90 % of their draws.
+    - `interval_90`: share of the recorded coordinates that lie within the middle 90 % of the draws from their density.
     - `landing_crps_cm`: continuous ranked probability score of the landing place, at which the ball comes down through
       the plane at `height`; mean of x and y. `landing_cover_90`: share of true places within the ellipse that contains
       90 % of the sampled places. `landing_missed`: share of the draws that do not land. All three are over windows

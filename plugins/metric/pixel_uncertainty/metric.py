@@ -29,7 +29,7 @@ class PixelUncertainty(Metric, HasFigure):
 
     Each image is evaluated by itself; the results are means over images, with standard errors:
 
-    - `pixel_coverage_90`: share of values between their 5 % and 95 % quantiles.
+    - `pixel_coverage_90`: share of values between the 5 % and the 95 % quantile of their densities.
     - `pixel_coverage_error`: mean |share - mass| over the masses 0.05, 0.10, ..., 0.95.
     - `spearman`: rank correlation, over the pixels of an image, between the mean |error| and the predicted scale, which
       is the root of the mean variance over channels. The error is that of the point prediction, rounded to `steps`. The

@@ -52,8 +52,9 @@ def areas_without_each(
 
     Let S(k) be the expected total risk of the k most confident predictions, and let the positions a + 1 to e of the
     order be the group of ties with prediction j. Without j, the total risk of the k most confident is S(k) for k ≤ a,
-    and S(k + 1) - r_j for k ≥ e - 1. In between, it is S(a) + (k - a) g, where g is the mean risk of the other ties.
-    Sums of these totals divided by k are differences of cumulative sums, so that all n areas take n log n operations.
+    and S(k + 1) - r_j for k ≥ e - 1. In between, the total risk is S(a) + (k - a) g, where g is the mean risk of the
+    other ties. Sums of these totals divided by k are differences of cumulative sums, so that all n areas take n log n
+    operations.
     """
     count, risk = len(risk), risk.double()
     _, group, size = confidence.neg().unique(return_inverse=True, return_counts=True)

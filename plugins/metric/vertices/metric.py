@@ -26,7 +26,7 @@ class VertexError(Mean):
     The target holds x, y, z of the first vertex, then of the second, and so on. The batch field "scale" (batch,), in
     metres per unit of the target, converts distances to centimetres. The reported mean is the mean over bodies of the
     mean over a body's vertices; its standard error is over bodies. Median and 95th percentile are over all vertices of
-    all bodies. They are computed from a histogram and are therefore exact to 1 %.
+    all bodies. Both are computed from a histogram and are therefore exact to 1 %.
 
     Raises:
         ConfigError: the target is not made of vertices.

@@ -61,7 +61,8 @@ def add_edge_gradients(
 def collect_gradient_pixels(face, color, grad_image):
     """Return the pixels at which the gradient of the loss with respect to the colour is not 0, line by line.
 
-    These are the stored pixels. I is the colour of a pixel, and g is the gradient with respect to it.
+    These are the stored pixels. I is the colour of a pixel, and g is the gradient of the loss with respect to this
+    colour.
 
     Returns:
         before: (lines, length + 1), number of stored pixels before each pixel.
@@ -103,8 +104,8 @@ def sum_line_gradients(
 ):
     """Add the gradient of the loss with respect to each vertex's position along the lines to `grad_position`.
 
-    Its unit is loss per pixel of motion. `axis` is 0 if the lines are rows, and 1 if they are columns. The other
-    arguments are those of `add_edge_gradients`, and the results of `collect_gradient_pixels`.
+    The unit of this gradient is loss per pixel of motion. `axis` is 0 if the lines are rows, and 1 if they are columns.
+    The other arguments are those of `add_edge_gradients`, and the results of `collect_gradient_pixels`.
     """
     lines, length = face.shape
     least = LEAST_DISTANCE * length / 2

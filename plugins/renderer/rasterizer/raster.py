@@ -323,8 +323,9 @@ def is_hidden(farthest, pixels, nearest):
 def update_tiles(farthest, empty, changed, pixels, written, depth):
     """Record that `written` pixels of the box `pixels` were written, and update `farthest` for the tiles of the box.
 
-    The largest depth of a tile is computed when all pixels of the tile show a face for the first time. It is computed
-    again whenever as many pixels have been written since then as the tile has. The arrays are those of `rasterise`.
+    The largest depth of a tile is computed when all pixels of the tile show a face for the first time. The largest
+    depth is computed again whenever as many pixels have been written since then as the tile has. The arrays are those
+    of `rasterise`.
     """
     first_row, last_row, first_column, last_column = pixels
     for row in range(first_row // TILE, last_row // TILE + 1):

@@ -32,7 +32,8 @@ class BatchEnsemble(Uncertainty):
 
     Args:
         members: T.
-        spread: standard deviation of the initial factors around 1; members that start alike end alike.
+        spread: standard deviation of the initial factors around 1; members whose initial factors are similar stay
+            similar in training.
 
     Attributes:
         members: number of members that are used, counted from the first; may be lowered after training (a knob).

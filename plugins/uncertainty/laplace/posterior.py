@@ -45,10 +45,10 @@ def fisher_of_raw(
     """Return the Fisher information of the raw parameters of each sample, float64.
 
     It is E[g gᵀ] over targets y of the predicted density, with the score g = ∇ log p(y | raw). Where the raw parameters
-    are natural parameters, it equals the generalised Gauss-Newton matrix (Martens 2020); it is positive
-    semi-definite for every density. For classes, the expectation is a sum over all classes. If the Hessian of -log p is
-    the same for all y, as for a normal density of fixed variance, the expectation is this Hessian. For any other
-    density, it is a mean over DRAWS draws of y.
+    are natural parameters, the information equals the generalised Gauss-Newton matrix (Martens 2020). The information
+    is positive semi-definite for every density. For classes, the expectation is a sum over all classes. If the Hessian
+    of -log p is the same for all y, as for a normal density of fixed variance, the expectation is this Hessian. For any
+    other density, it is a mean over DRAWS draws of y.
 
     Args:
         density_of: function from raw parameters to densities of batch_shape (batch,).
@@ -203,9 +203,9 @@ def draw_deviations(
 ) -> Float[Tensor, "sample raw feature"]:
     """Return random deviations of the weights from their mean, with the covariance (H + λ I)⁻¹.
 
-    They are the symmetric root of the covariance times the noise. This root is a continuous function of H and does not
-    depend on the signs of the eigenvectors. An H that differs only by rounding, because it comes from another machine
-    or from the samples in another order, therefore gives nearly the same deviations.
+    The deviations are the symmetric root of the covariance times the noise. This root is a continuous function of H and
+    does not depend on the signs of the eigenvectors. An H that differs only by rounding, because it comes from another
+    machine or from the samples in another order, therefore gives nearly the same deviations.
 
     Args:
         eigen: H.
