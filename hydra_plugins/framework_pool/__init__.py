@@ -45,7 +45,7 @@ class EngineLauncher(Launcher):
 
     Args:
         jobs: number of jobs that run at once; None: all.
-        retries: number of times that a killed job is started again; it resumes from its checkpoint.
+        retries: number of times that a killed job is started again; the job then resumes from its checkpoint.
         devices: CUDA devices to assign, one to each running job; None: every job sees all devices.
         eager: whether the command returns as soon as all jobs are started, without waiting for their ends.
     """
@@ -280,7 +280,7 @@ class PoolLauncher(EngineLauncher):
 
     Args:
         jobs: number of jobs that run at once; None: half the number of cores.
-        retries: number of times that a killed job is started again; it resumes from its checkpoint.
+        retries: number of times that a killed job is started again; the job then resumes from its checkpoint.
         devices: CUDA devices to assign, one to each running job, such as [0, 1]; None: every job sees all devices.
         fork: whether jobs are forks of one process that has already imported the modules of their modes, which saves
             seconds per job; None: fork on Linux if there are several jobs. Every job has its own process in both cases.
@@ -312,7 +312,7 @@ class SlurmLauncher(EngineLauncher):
 
     Args:
         jobs: number of jobs that are submitted at once; None: all.
-        retries: number of times that a killed job is submitted again; it resumes from its checkpoint.
+        retries: number of times that a killed job is submitted again; the job then resumes from its checkpoint.
         eager: whether the command returns as soon as all jobs are submitted. The same command, given again later,
             waits for the jobs and prints the table of their results.
         settings: resources of each job; see `SlurmSettings`.
@@ -342,7 +342,7 @@ class RayLauncher(EngineLauncher):
 
     Args:
         jobs: number of tasks that are submitted at once; None: all, and Ray runs those for which there are resources.
-        retries: number of times that a killed job is started again; it resumes from its checkpoint.
+        retries: number of times that a killed job is started again; the job then resumes from its checkpoint.
         settings: cluster, and resources of each job; see `RaySettings`.
     """
 

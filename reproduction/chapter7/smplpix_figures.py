@@ -2,9 +2,9 @@
 
     python -m reproduction.chapter7.smplpix_figures <run of smplpix/quick> <run of smplpix/hybrid>
 
-The figures show other people, views, poses and shapes than the training data. Each compares projected points, the mesh,
-the image of each run and the photograph, and shows the errors. The script writes smplpix_figures.md and the figures
-beside this file.
+The figures show other people, views, poses and shapes than the training data. Each figure compares projected points,
+the mesh, the image of each run and the photograph, and shows the errors. The script writes smplpix_figures.md and the
+figures beside this file.
 """
 
 import math

@@ -22,7 +22,7 @@ class Archive(NamedTuple):
     """Published data set, and a function that writes synthetic heads in its layout.
 
     Attributes:
-        name: Name of its folder in the cache.
+        name: Name of the data set's folder in the cache.
         folder: Name of the folder that the archive unpacks to.
         parts: Entries of that folder; names of folders end in a slash.
         version: Version of `draw`. If the output of `draw` changes, increase it, so that a new folder is written.

@@ -69,7 +69,7 @@ class HumanScans(Data, SubjectFolder, HasScenes):
     (`framework.geometry.camera.canonical_camera`: x right, y down, z forward, metres) and its red, green and blue as
     files hold them, sRGB in [0, 1]. The target is the photograph, (height, width, 3), sRGB in [0, 1], composited on
     white with its mask in linear RGB. Batches also hold "color", the photograph in linear RGB; "mask" (height, width),
-    bool, true for pixels that the subject covers by half or more; "subject", int64, its number in the split.
+    bool, true for pixels that the subject covers by half or more; "subject", int64, the subject's number in the split.
 
     Args:
         renderer: draws the photographs of generated people.

@@ -23,8 +23,8 @@ def flow(
     """Return the optical flow from the second image back to the first, and a mask of the pixels with a known flow.
 
     For each pixel of the second image the flow is the position (column, row), float64, of the same point of the mesh in
-    the first. A point is seen in an image if the pixels around it show the mesh at its depth: it lies neither at an
-    outline nor behind something. The flow of a point that is not seen in both images has no meaning, and the mask is
+    the first image. A point is seen in an image if the pixels around it show the mesh at its depth: it lies neither at
+    an outline nor behind something. The flow of a point that is not seen in both images has no meaning, and the mask is
     False there. `before` and `after` are scenes of one mesh with the same faces; `channels_before` and `channels_after`
     are the rendered `CHANNELS`.
     """

@@ -134,8 +134,8 @@ class PointCloudFolder(LabelledClouds):
         validation: Share of the files for validation, equal in every class, if there are no folders of that split. With
             0 the training split is also used for validation: early stopping and calibration then use training data.
         test: Share of the files for the test, equal in every class, if there are no folders of that split.
-        centred: Whether to subtract each cloud's mean in float64 before it is rounded to float32; map coordinates need
-            this.
+        centred: Whether to subtract each cloud's mean in float64 before the cloud is rounded to float32; map
+            coordinates need this.
         unreadable: Treatment of files that cannot be read. "error" refuses them, "skip" leaves them out.
         data_seed: Seed of points and splits, independent of the seed of the run.
     """

@@ -49,7 +49,7 @@ class Reading:
         columns: Attributes in addition to x, y, z. The normals of points of a mesh are the normals of its faces; its
             other attributes are interpolated.
         seed: Seed of the random points, which depend only on the seed and on the name of the file.
-        centred: Whether to subtract each cloud's mean before it is rounded to float32.
+        centred: Whether to subtract each cloud's mean before the cloud is rounded to float32.
         surface: Whether files without faces are refused.
     """
 

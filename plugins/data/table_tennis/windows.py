@@ -58,7 +58,7 @@ class Window(NamedTuple):
 
 
 def prefix(flight: Flight, now: int, grid: Grid) -> Float[np.ndarray, "number"] | None:
-    """Return the input at frame `now`; None if fewer than `grid.least` frames are present.
+    """Return a model's input at frame `now`; None if fewer than `grid.least` frames are present.
 
     Each frame is assigned to the nearest multiple of `grid.step` before frame `now`. If two frames are assigned to the
     same multiple, the nearer frame is used.

@@ -25,9 +25,9 @@ class LSTMHead(DensityHead):
     """LSTM over the observed and then the future frames (Hochreiter & Schmidhuber 1997; reference [121] of the thesis).
 
     At each frame the network predicts the ball's displacement to the next frame, and the standard deviation of this
-    displacement. If the next frame is missing or in the future, the network reads its predicted position instead. So
-    errors accumulate with time, which this head is meant to demonstrate. The coordinates of a frame are independent and
-    normal; the head is trained by likelihood.
+    displacement. If the next frame is missing or in the future, the network reads the position that it predicted for
+    this frame. So errors accumulate with time, which this head is meant to demonstrate. The coordinates of a frame are
+    independent and normal; the head is trained by likelihood.
 
     Args:
         observed: number of frames of an input; the same value as in the config of the data.

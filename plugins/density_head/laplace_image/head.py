@@ -43,9 +43,9 @@ class LaplaceImageHead(DensityHead):
             the most likely factor over all pixels. That factor suits predicted scales badly: three quarters of an image
             of a person are background, whose errors are far smaller than any useful scale, and they make the factor too
             small for the person.
-        balance: β of Seitzer et al. 2022: the gradient of each number, not the loss, is multiplied by its scale to this
-            power. With 0 (the likelihood alone) a location is learned more slowly the wider its scale is, so that large
-            errors persist. With 1 all locations are learned as with the L1 distance.
+        balance: β of Seitzer et al. 2022: the gradient of each number, not the loss, is multiplied by the number's
+            scale to the power β. With 0 (the likelihood alone) a location is learned more slowly the wider its scale
+            is, so that large errors persist. With 1 all locations are learned as with the L1 distance.
         floor: constant that is added to every predicted scale. Where an image is exactly white, the likelihood would
             otherwise grow without end as the scale shrinks, until one wrong pixel outweighs a whole image. Half a step
             of an 8-bit image, 0.002, prevents that.

@@ -12,9 +12,9 @@ class MatrixFisherHead(MatrixHead):
 
     The thesis leaves this joint density to future work (§3.7). The network is as in Mohlin et al. 2020.
 
-    The head reads the nine elements of a matrix X, row by row. F is a multiple of X that grows faster than X
-    (`grown_matrix`). F is the density's natural parameter, so that the uniform density of rotations, X = 0, needs
-    no special case.
+    The head reads the nine elements of a matrix X, row by row. The parameter F of the density (`MatrixFisher`) is a
+    multiple of X that grows faster than X (`grown_matrix`). F is the density's natural parameter, so that the uniform
+    density of rotations, X = 0, needs no special case.
 
     Raises:
         ConfigError: the target is not azimuth, elevation and tilt, in this order.

@@ -20,9 +20,9 @@ LARGEST_FACTOR = 3.0
 class ProjectedNormalHead(DensityHead):
     """One projected normal density for each angle (Mardia & Jupp 2000, §3.5.6; Wang & Gelfand 2013).
 
-    For each angle the head reads a pair (x, y) and, with `shape="general"`, s and t. The mean of the normal vector is
-    μ = (x, y) √(1 + (x² + y²)/16), so that the concentration |μ|² grows with the fourth power of the pair. s and t are
-    bounded smoothly by LARGEST_FACTOR. The uniform density is x = y = s = t = 0.
+    For each angle the head reads a pair (x, y) and, with `shape="general"`, s and t. The mean of the normal vector is μ
+    = (x, y) √(1 + (x² + y²)/16), so that the concentration |μ|² grows with the fourth power of the length of (x, y). s
+    and t are bounded smoothly by LARGEST_FACTOR. The uniform density is x = y = s = t = 0.
 
     Args:
         shape: "general": any covariance, so that the density may be skewed or have two peaks; "isotropic": the unit

@@ -10,8 +10,9 @@ LARGEST_PARAMETER = 1e6
 class RotationLaplaceHead(MatrixHead):
     """One rotation Laplace density of azimuth, elevation and tilt, which has heavier tails than matrix Fisher.
 
-    The head reads the nine elements of a matrix X, row by row, and A is a multiple of X that grows faster than X
-    (`grown_matrix`). In Yin et al. 2023, Def. 3, A = X. The uniform density of rotations is X = 0.
+    The head reads the nine elements of a matrix X, row by row, and the parameter A of the density (`RotationLaplace`)
+    is a multiple of X that grows faster than X (`grown_matrix`). In Yin et al. 2023, Def. 3, A = X. The uniform density
+    of rotations is X = 0.
 
     Raises:
         ConfigError: the target is not azimuth, elevation and tilt, in this order.

@@ -34,8 +34,9 @@ class VonMisesHead(DensityHead):
     eq. 3.1, and κ were g(r), the gradients in the pair and in r would vanish with κ. A network that cannot predict an
     angle at first would then never learn it (README).
 
-    With "fixed" it reads (cos, sin) and trains with κ = 1, which is the cosine loss of Biternion networks up to
-    constants (eq. 3.8-3.9); `calibrate` sets one κ per angle by maximum likelihood on the validation split (eq. 3.5).
+    With `concentration="fixed"` the head reads (cos, sin) and trains with κ = 1, which is the cosine loss of Biternion
+    networks up to constants (eq. 3.8-3.9); `calibrate` sets one κ per angle by maximum likelihood on the validation
+    split (eq. 3.5).
 
     Args:
         concentration: source of κ.

@@ -28,8 +28,8 @@ class BallisticEncoder(Encoder):
     learnt.
 
     Args:
-        future: number of future frames, as in the data.
-        step: time from frame to frame, s, as in the data.
+        future: number of future frames; the same value as in the config of the data.
+        step: time from frame to frame, s; the same value as in the config of the data.
         spin: prior standard deviation of each component of the spin, rad/s.
         noise: standard deviation of the measurement error of each coordinate, m.
         constants: constants of the ball and the table.

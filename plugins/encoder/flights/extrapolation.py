@@ -41,8 +41,8 @@ class ExtrapolationEncoder(Encoder):
     that an outlier has little influence. Drag, spin, table and bounce are not modelled. Nothing is learnt.
 
     Args:
-        future: number of future frames, as in the data.
-        step: time from frame to frame, s, as in the data.
+        future: number of future frames; the same value as in the config of the data.
+        step: time from frame to frame, s; the same value as in the config of the data.
         noise: standard deviation of the measurement error of each coordinate, m.
 
     Raises:

@@ -38,7 +38,7 @@ class DGCNN(CloudNetwork):
         neighbours: number of nearest neighbours, including the point itself.
         edge_widths: number of outputs of each edge convolution.
         point_width: number of outputs of the layer before the maximum and the mean over the cloud.
-        widths: number of outputs of each layer after them; the last is the length of the features.
+        widths: number of outputs of each layer after the maximum and the mean; the last is the length of the features.
         dropout: probability of dropping an output of each of these last layers.
         points: number of points at the beginning of a cloud that are read; None for all.
         normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`).

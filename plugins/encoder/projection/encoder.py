@@ -31,7 +31,7 @@ NOTHING = torch.iinfo(torch.int64).max
 class CameraView:
     """The camera that all images share (`framework.geometry.camera.canonical_camera`), for one size of images.
 
-    It also holds the range of visible depths and the number of levels.
+    The object also holds the range of visible depths and the number of images.
 
     Attributes:
         height, width: size of the image, pixels.

@@ -37,9 +37,9 @@ class Layer(nn.Module):
         outputs: number of channels of the output maps.
         size: side of the kernel, pixels; 3 keeps the size of the image, 2 halves it.
         normalisation: "batch" normalises by the moments of the batch. "renorm" normalises by the moments of the batch,
-            and then corrects the numbers towards those that the running moments give (Ioffe 2017). "group" normalises
-            by the moments of each image's groups of channels. "batch" and "renorm" use the running moments in
-            evaluation.
+            and then moves the normalised numbers towards those that the running moments would give (Ioffe 2017).
+            "group" normalises by the moments of each image's groups of channels. "batch" and "renorm" use the running
+            moments in evaluation.
     """
 
     mean: Tensor

@@ -25,7 +25,7 @@ class LPIPS(PerImage):
     Args:
         backbone: "alex", which the authors recommend for comparisons and which papers report; or "vgg".
         weights: local file of the backbone in torchvision's format: alexnet-owt-7be5be79.pth or vgg16-397923af.pth.
-        masked: also compute the distance inside the true mask; batches must then have the field "mask".
+        masked: whether to compute the distance also inside the true mask; batches must then have the field "mask".
 
     Raises:
         ConfigError: the file of weights does not exist.

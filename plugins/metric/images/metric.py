@@ -44,7 +44,7 @@ class PSNR(PerImage):
 
     Args:
         encoding: encoding in which colours are compared, "srgb" or "linear" RGB.
-        masked: also compute the ratio inside the true mask; batches must then have the field "mask".
+        masked: whether to compute the ratio also inside the true mask; batches must then have the field "mask".
         ceiling_db: upper limit of the ratio; it replaces the infinite ratio of images without error. 100 dB is an error
             of 1e-5, which is 1/400 of a step of 8 bits. `psnr_exact` is the share of images at the ceiling.
     """
@@ -83,7 +83,7 @@ class SSIM(PerImage):
 
     Args:
         encoding: encoding in which colours are compared, "srgb" or "linear" RGB.
-        masked: also compute the similarity inside the true mask; batches must then have the field "mask".
+        masked: whether to compute the similarity also inside the true mask; batches must then have the field "mask".
 
     Raises:
         DataError: a side of an image has fewer than 11 pixels.

@@ -45,7 +45,7 @@ class PixelUncertainty(Metric, HasFigure):
 
     Args:
         steps: number of steps between the stored values 0 and 1; 0 if values were not rounded.
-        masked: also compute the results inside the true mask; batches must then have the field "mask".
+        masked: whether to compute the results also inside the true mask; batches must then have the field "mask".
 
     Raises:
         ConfigError: the target is not an image.

@@ -89,7 +89,7 @@ def layers_of(depth: Depth, last: tuple[int, int]) -> list[tuple[int, int, int]]
 
 
 def read_vgg(depth: Depth, file: str) -> VGG:
-    """Return the network with the weights in torchvision's file of the whole network, or of its `features` alone.
+    """Return a VGG network with the weights of torchvision's file of the whole network, or of its `features` alone.
 
     Raises:
         ConfigError: the file does not exist, or holds the weights of another network.
@@ -113,7 +113,7 @@ def read_vgg(depth: Depth, file: str) -> VGG:
 
 
 def random_vgg(depth: Depth, width: int, taps: Sequence[tuple[int, int]], seed: int) -> VGG:
-    """Return the network with random weights, which preserve the scale of the features from layer to layer.
+    """Return a VGG network with random weights, which preserve the scale of the features from layer to layer.
 
     The variance of the weights follows He et al. 2015, eq. 10.
 

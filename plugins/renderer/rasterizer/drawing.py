@@ -35,7 +35,7 @@ class DrawingSettings:
         faces: faces of the scene.
         near: distance of the near plane, metres.
         size: (height, width), pixels.
-        cull: leave out faces seen from behind.
+        cull: whether faces seen from behind are left out.
         channels: channels to draw, in this order.
         gradient: kind of gradient, see `Rasterizer`; "soft" also changes the image.
         softness: σ and γ of "soft".

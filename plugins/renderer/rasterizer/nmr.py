@@ -43,7 +43,8 @@ def add_edge_gradients(
 ) -> None:
     """Add the gradient that comes from moving edges to `grad_points` and `grad_lens`.
 
-    All pairs of a pixel and an edge contribute, along the rows and along the columns of the image.
+    All pairs of a pixel and an edge contribute, along the rows and along the columns of the image. `color` and
+    `grad_image` are (height, width, channels). The other arrays are described in `raster`.
     """
     for axis in (0, 1):
         if axis == 1:

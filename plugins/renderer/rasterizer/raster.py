@@ -178,7 +178,7 @@ def rasterise(
         faces: (faces, 3), indices of rows of `screen`.
         first: number of the first face, if `numbers` is None.
         numbers: (faces), number of each face, or None; faces with the same number are parts of one face.
-        cull: leave out faces seen from behind.
+        cull: whether faces seen from behind are left out.
         height: height of the image, pixels.
         width: width of the image, pixels.
         depth: depths, or None.

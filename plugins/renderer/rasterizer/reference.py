@@ -40,7 +40,7 @@ def render(
         near: distance of the near plane, metres.
         size: height and width of the image, pixels.
         channels: names of the channels.
-        cull: leave out faces seen from behind.
+        cull: whether faces seen from behind are left out.
     """
     rotation, translation, lens = pose
     faces = faces.long()
@@ -93,7 +93,7 @@ def find_visible_faces(
         lens: fx, fy, cx, cy, pixels.
         near: distance of the near plane, metres.
         size: height and width of the image, pixels.
-        cull: leave out faces seen from behind.
+        cull: whether faces seen from behind are left out.
     """
     height, width = size
     screen = ((lens[:2] * camera_points[:, :2] / camera_points[:, 2:] + lens[2:]) * SUBPIXELS).round()
@@ -191,7 +191,7 @@ def triple_products(normals: Tensor, lens: Tensor, pixels: Tensor, absolute: boo
 
     The pixels are given as `pixels`, (pixels, 2), column and row. Their normals are `normals`, (pixels, 3, 3).
 
-    If `absolute` is true, return the sums of the absolute values of the terms.
+    If `absolute` is true, return the sums of the absolute values of the terms of these products.
     """
     ray = (pixels - lens[2:]) / lens[:2]
     terms = torch.cat([ray, torch.ones_like(ray[:, :1])], -1)[:, None] * normals

@@ -34,7 +34,7 @@ class Rasterizer(Renderer):
     focal lengths and principal point. "depth" has a gradient too, but without the effect of moving edges.
 
     Args:
-        cull: leave out faces seen from behind; faster, but correct for closed meshes only.
+        cull: whether faces seen from behind are left out; faster, but correct for closed meshes only.
         gradient: "boundary": gradients inside of faces, and from moving edges at which one surface replaces another;
             "interior": gradients inside of faces only; "nmr": the approximation of Kato et al., for comparison; "soft":
             the blurred and blended image of Liu et al., for comparison, which changes "color" and shows vertex colours

@@ -87,7 +87,7 @@ def render(
         faces: (faces, 3), indices of vertices.
         colors: (vertices, channels).
         lens: fx, fy, cx, cy, pixels.
-        cull: leave out faces seen from behind.
+        cull: whether faces seen from behind are left out.
         size: height and width of the image, pixels.
         sigma: σ, the blur of coverage, a squared distance in units in which the image's shorter side is 2.
         gamma: γ, the blur of depth, in units of the ratio of the nearest depth to a face's depth.
@@ -120,7 +120,8 @@ def add_gradients(
 ) -> None:
     """Add the gradients of a loss to `grad_points`, `grad_colors` and `grad_lens`.
 
-    `grad_image` is the gradient of the loss with respect to the image, and `blend_data` the result of `render`.
+    `grad_image` is the gradient of the loss with respect to the image, and `blend_data` the result of `render` for the
+    same camera points, faces, colours and lens.
     """
     if blend_data.nearest >= 0:
         arrays = (blend_data.positions, blend_data.bounds, blend_data.nearest, *blend_data.scales)
