@@ -117,7 +117,7 @@ def write_value(folder: Path, value: float) -> None:
 def refuse_idle(folder: Path, sentence: str) -> None:
     """Refuse a setting that has no effect; in a job of a sweep, print `sentence` instead.
 
-    Other jobs of the sweep may read the setting.
+    In a sweep the setting is not refused, because other jobs of the sweep may read it.
 
     Args:
         folder: Folder of the run.

@@ -51,7 +51,12 @@ BEST = "best.ckpt"
 
 
 def send_rest(folder: Path, store: str | None) -> bool:
-    """Send the journal lines that a run of status FINISHED could not send; return whether there were any."""
+    """Send the journal lines that a run of status FINISHED could not send; return whether there were any.
+
+    Args:
+        folder: Folder of the run.
+        store: Address of the tracking store that the command names; None if it names none.
+    """
     info = read_run_info(folder)
     if info is None or info.status != "FINISHED" or not info.uri:
         return False

@@ -187,8 +187,8 @@ def run(
         devices: CUDA devices to distribute, one to each running job; if empty, all jobs see all devices.
         parent: Id of the tracking run under which the jobs are recorded.
         sender: Object that sends the journals of ended jobs to the tracking store; None without a store.
-        eager: Return as soon as every job has been started and no ended job is left unnoticed. The jobs must outlive
-            this process.
+        eager: Return as soon as every job has been started, and the engine has confirmed that each job that has not
+            ended waits or runs. The jobs must outlive this process.
         watch: Function that is called for each running job in turn, about every `engine.interval` seconds.
 
     Raises:

@@ -1,9 +1,9 @@
 """Running of a sweep's job on a node of a cluster, and the file in which the node records how the job ended.
 
-A job runs only if its record job.json still holds the handle by which the cluster called it: the launcher may have
-cancelled the job, or started it again. The folder of the sweep is on a file system that all nodes share. A node and the
-launcher exchange nothing but files of the job's folder: only the launcher writes job.json, and only the node writes
-node.json.
+A node runs a job only if the record job.json still holds the handle with which the cluster started it: in the meantime,
+the launcher may have cancelled the job, or started it again with another handle. The folder of the sweep is on a file
+system that all nodes share. A node and the launcher exchange nothing but files of the job's folder: only the launcher
+writes job.json, and only the node writes node.json.
 """
 
 import json
