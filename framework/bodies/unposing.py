@@ -26,7 +26,7 @@ class Unposed(NamedTuple):
 
     Attributes:
         offsets: displacements in the rest pose, metres.
-        folded: true for each vertex whose blended matrix A = Σ_j w_j R_j has a singular value below SMALLEST.
+        folded: true for each vertex whose blended matrix (`BodyModel.skinning`) has a singular value below SMALLEST.
     """
 
     offsets: Float[Tensor, "batch vertex 3"]

@@ -60,5 +60,5 @@ def fetch(dataset: Dataset[Batch], indices: Sequence[int]) -> Batch:
 
 
 def as_batch(items: Mapping[str, Tensor] | list[Batch]) -> Batch:
-    """Return `items` as a batch: a batch from `__getitems__` unchanged, or a list of single samples stacked."""
+    """Return `items` as a batch: a batch from `__getitems__` stays as it is, a list of single samples is stacked."""
     return dict(items) if isinstance(items, Mapping) else default_collate(items)

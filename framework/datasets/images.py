@@ -295,7 +295,7 @@ def _eight_bit(strip: Image.Image, stored: _Encoding) -> Image.Image:
 
 
 def cut_square(image: Image.Image, box: Box, margin: float, side: int) -> NDArray[np.uint8] | None:
-    """Crop the square around a box and scale it; None if the box is empty.
+    """Crop the square around a box and scale this square to `side` pixels; return None if the box is empty.
 
     The returned array has the shape (channels, side, side). The box is first clipped to the image. The square is
     centred at the clipped box; its side is the longer side of this box times 1 + 2 `margin`. Where the square extends

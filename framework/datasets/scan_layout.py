@@ -190,7 +190,7 @@ def read_registration(file: Path) -> RegisteredMesh:
 
 
 def vertex_colors(mesh: meshes.Mesh) -> UInt8[np.ndarray, "vertices 3"]:
-    """Return the 8-bit colours of a mesh.
+    """Return the 8-bit colour of each vertex of a mesh.
 
     Raises:
         DataError: the mesh has no colours.

@@ -13,7 +13,7 @@ class IndependentNormals(Independent):
     """The normal density of several independent numbers.
 
     Args:
-        mean: (*batch, number).
+        mean: mean of each number, (*batch, number).
         scale: standard deviations, (*batch, number).
     """
 
@@ -49,7 +49,7 @@ class JointNormal(MultivariateNormal):
     """The normal density of several correlated numbers, with covariance R Rᵀ.
 
     Args:
-        mean: (*batch, number).
+        mean: mean of each number, (*batch, number).
         root: R, (*batch, number, number), lower triangular with a diagonal above 0.
     """
 

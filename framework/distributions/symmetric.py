@@ -24,7 +24,7 @@ class Symmetric(PlainDensity):
 
     @property
     def support(self) -> constraints.Constraint:
-        """Support of the density; the default is that of real numbers."""
+        """Support of the density; the default is all real numbers."""
         return constraints.real_vector
 
     @property

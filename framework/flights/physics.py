@@ -30,7 +30,7 @@ class Constants:
         drag: k of the deceleration k |v| v, 1/m (Mülling et al. 2011, eq. 1).
         lift: m of the Magnus acceleration m ω × v, dimensionless: ρ A r c / (2 · mass) with the density ρ of air, the
             ball's cross-section A and radius r, and the lift coefficient c = 0.6.
-        spin_decay: rate k of the exponential decay of the spin ω, dω/dt = -k ω, 1/s.
+        spin_decay: rate of the exponential decay of the spin ω, dω/dt = -`spin_decay` · ω, 1/s.
         restitution: upward speed after the bounce divided by downward speed before it.
         friction: Coulomb's coefficient of friction between ball and table.
         radius: radius of the ball, m.

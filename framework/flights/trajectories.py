@@ -21,7 +21,7 @@ def free_flight(
 ) -> Float[Tensor, "flight 9"]:
     """Return the state after `time` seconds without a table: one step of the classical Runge-Kutta method (order 4).
 
-    For 16 ms at 6 m/s its error is below 1e-8 m (tests/test_flight_physics.py). The acceleration is evaluated four
+    For 16 ms at 6 m/s the error is below 1e-8 m (tests/test_flight_physics.py). The acceleration is evaluated four
     times per step, as the method requires. The spin decays independently of the motion, so its values at these four
     evaluations are the initial spin times polynomials of decay rate · `time`.
     """

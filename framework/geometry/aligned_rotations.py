@@ -44,11 +44,11 @@ LARGE = 25.0
 
 
 class Frame(NamedTuple):
-    """The proper singular value decomposition of F, with falls instead of singular values.
+    """The proper singular value decomposition F = U S Vᵀ of the parameter F of a matrix Fisher density.
 
     Attributes:
         left, right: (*batch, 3, 3), the rotations U and V.
-        falls: (*batch, 3), λ in ascending order.
+        falls: (*batch, 3), sums 2(s₂+s₃), 2(s₁+s₃), 2(s₁+s₂) of singular values, λ₁ ≤ λ₂ ≤ λ₃.
     """
 
     left: Tensor
@@ -106,7 +106,7 @@ def entropy(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
 
 @torch.no_grad()
 def align(parameter: Float[Tensor, "*batch 3 3"]) -> Frame:
-    """Return the proper singular value decomposition of F, which is `parameter`, float64.
+    """Return the proper singular value decomposition of the parameter F of a matrix Fisher density, float64.
 
     If singular values are equal, the decomposition is not unique, and any one of them is returned.
     """

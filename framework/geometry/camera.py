@@ -74,8 +74,8 @@ class Camera:
     def to_canonical(self, points: Real[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
         """Return world points in coordinates of the `canonical_camera` of the same image size, metres.
 
-        The canonical camera sees them at the same pixels and depths. So the cloud alone determines the view, and the
-        camera is not needed any more.
+        The canonical camera sees them at the same pixels and depths. So the new coordinates alone determine the view,
+        and the camera is not needed any more.
 
         With (x, y, z) = rotation @ X + translation, and with the focal length f and the principal point (c, d) of the
         canonical camera, the new coordinates are ((fx x + (cx - c) z) / f, (fy y + (cy - d) z) / f, z). Let x' be the

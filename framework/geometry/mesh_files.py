@@ -32,7 +32,7 @@ PADDING = 8
 
 
 class Parsed(NamedTuple):
-    """The content of a file.
+    """The content of a mesh or cloud file.
 
     Attributes:
         vertices: coordinates.
@@ -285,7 +285,10 @@ def join_continued_lines(content: bytes) -> bytes:
 
 
 def statements(content: bytes, names: Sequence[bytes] = ()) -> Iterator[tuple[bytes, bytes]]:
-    """Yield the first word and the rest of each line of an OBJ or MTL file; `names` has its meaning in `text_lines`."""
+    """Yield the first word and the rest of each line of an OBJ or MTL file, without comments.
+
+    Lines whose first word is in `names` are kept whole.
+    """
     for line in text_lines(content, names=names):
         key, *rest = line.split(None, 1)
         yield key, rest[0].rstrip() if rest else b""

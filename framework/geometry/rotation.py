@@ -35,7 +35,7 @@ def geodesic_distance(
 
 
 def about_z(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 3"]:
-    """Return the rotation about the third axis, radians, counter-clockwise seen from its positive end."""
+    """Return the rotation by `angle`, radians, about the third axis, counter-clockwise seen from its positive end."""
     cos, sin, zeros, ones = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
     rows = torch.stack([cos, -sin, zeros, sin, cos, zeros, zeros, zeros, ones], -1)
     return rows.unflatten(-1, (3, 3))

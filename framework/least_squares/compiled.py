@@ -88,7 +88,9 @@ def solve(factor, right):
 def compute_steps(
     at, lower, upper, cost, gradient, gram, curve, scale, damping, move, gain, slope, least, cut, careful
 ):
-    """Compute the damped step of every problem within its bounds, and fill the arrays that describe it.
+    """Compute the damped step of every problem within its bounds, and fill the arrays that describe the step.
+
+    J is the Jacobian of the residuals r of a problem with p parameters.
 
     Args:
         at: parameters, (problem, p).
@@ -190,6 +192,8 @@ def judge_steps(
 ):  # fmt: skip
     """Accept or reject the step of every problem, and update the state of the problem accordingly.
 
+    J is the Jacobian of the residuals r of a problem with p parameters.
+
     Args:
         at: parameters, (problem, p); updated.
         cost: half the sum of squared residuals, (problem,); updated.
@@ -280,7 +284,7 @@ def invert(gram, inverse, trace):
     matrix has no inverse; the matrix in `inverse` is then not written.
 
     Args:
-        gram: JᵀJ, (problem, p, p).
+        gram: JᵀJ for the Jacobian J of each problem, (problem, p, p).
         inverse: filled with the inverses, (problem, p, p).
         trace: filled with the traces, (problem,).
     """

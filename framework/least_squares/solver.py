@@ -186,12 +186,13 @@ def least_squares(
     The model is evaluated on the device of `start`; the small systems of equations are solved on the CPU.
 
     Args:
-        model: residuals and their Jacobian, see `Model`.
+        model: function that returns the residuals and their Jacobian (`Model`).
         start: (problem, p); clipped to the box.
         lower: lower bounds, broadcast to `start`; may be infinite.
         upper: upper bounds, broadcast to `start`; may be infinite.
-        normal: the sums of the model, see `Normal`; the model is then evaluated only if a matrix is close to singular.
-        curvature: the second derivatives, see `Curvature`.
+        normal: function that returns the sums over a problem's residuals (`Normal`); `model` is then called only if a
+            matrix is close to singular.
+        curvature: function that returns the second derivatives (`Curvature`).
         most: largest number of steps tried for each problem.
         decrease: the search ends if no step would lower the cost by more than this share of the cost.
         step: the search ends if no step would move the parameters by more than this share of their size.

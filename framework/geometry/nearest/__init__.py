@@ -32,7 +32,7 @@ class Nearest(NamedTuple):
 
     Attributes:
         distance: Euclidean distance, in the unit and the dtype of the coordinates; NaN for queries beyond
-            `query_sizes`.
+            `query_sizes` (an argument of `nearest`).
         index: row of the nearest point in the cloud, int64; 0 for queries beyond `query_sizes`. If the squares of
             several distances are equal after rounding to the dtype, it is the lowest row.
     """
@@ -69,7 +69,7 @@ class Queries:
 
 
 def prepare(queries: Tensor, once: bool = False) -> Queries:
-    """Return queries (query, 3) prepared for many clouds: `nearest` takes them in place of the tensor, and is faster.
+    """Return queries (query, 3) prepared for many clouds: `nearest` takes them in place of the tensor, which is faster.
 
     Args:
         queries: (query, 3).
@@ -199,7 +199,7 @@ def require_points(points: Tensor, name: str) -> None:
 
 
 def require_sizes(points: Tensor, sizes: Tensor | None, name: str) -> Tensor | None:
-    """Return `sizes` as int64 on the CPU; None if it is None.
+    """Return `sizes` as int64 on the CPU; None if `sizes` is None.
 
     Args:
         points: (batch, points, 3).

@@ -111,9 +111,10 @@ def bench(points: int, threads: int = 1) -> Bench:
 @compiled
 @no_type_check
 def cell_bits(points):
-    """Return the largest `bits` (at most BITS, at least 1) for which the grid has no more cells than there are points.
+    """Return the largest b, from 1 to BITS, for which a grid with 2^b cells along each axis has at most `points` cells.
 
-    If the points lie on a surface, most cells are empty, and the others hold several points.
+    With fewer than 8 points, b is 1. If the points lie on a surface, most cells are empty, and the other cells hold
+    several points.
     """
     bits = 1
     while bits < BITS and 8 ** (bits + 1) <= points:

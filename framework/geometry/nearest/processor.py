@@ -219,7 +219,7 @@ def search_all_share(cloud, size, packets, counter, step, distance, index):
 
 @lru_cache(maxsize=BITS)
 def curves(bits: int) -> NDArray[np.int32]:
-    """Return the cells in the order of the Hilbert curve, as `pack.curve` does, from a cache after the first call."""
+    """Return the cells in the order of the Hilbert curve, the table of `pack.curve`; a cache keeps the table."""
     return curve(bits)
 
 
