@@ -76,13 +76,13 @@ def decode_occupancy(clouds: Tensor, side: int) -> Tensor:
 
 
 def decode_deltas(clouds: Tensor, strategy: Strategy, count: int) -> Tensor:
-    """Encode clouds by deltas and decode them as basis point plus delta (eq. 6.5)."""
+    """Encode clouds by deltas from `count` basis points and decode them as basis point plus delta (thesis eq. 6.5)."""
     basis_points = prepare_basis(basis(strategy, count, 1.0, 13).float())
     return decode(encode(clouds, basis_points, ["delta"], "none"))
 
 
 def measure_errors(clouds: Tensor) -> list[dict[str, object]]:
-    """Measure the mean Chamfer distance (eq. 6.6) over the shapes for every method and length."""
+    """Measure the mean Chamfer distance (thesis eq. 6.6) over the shapes for every method and encoding length."""
     rows = []
 
     def measure(method: str, length: int, back: Tensor) -> None:

@@ -134,7 +134,7 @@ def page(rows: Mapping[tuple[str, str], Mapping[str, Any]]) -> str:
 
 
 def cell(results: Mapping[str, Any], key: str) -> str:
-    """Return a number with its standard error, or that it is not available."""
+    """Return the result `key` with its standard error as text, or a text that says that it is not available."""
     value, error = results.get(key), results.get(f"{key}_sem")
     return NOT_AVAILABLE if value is None or error is None else format_number(value, error)
 

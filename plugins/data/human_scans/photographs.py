@@ -33,9 +33,10 @@ def place_cameras(
 ) -> list[Camera]:
     """Return `count` cameras at positions of the rig, in random order, each of which sees the whole person.
 
-    Every position is used once before a position is used again. Each camera looks at the middle of the person from the
-    smallest distance at which it sees the whole person, or a little farther away. It is rolled by a degree or two, and
-    its principal point is a little off the middle of the image.
+    `vertices` are those of the person, metres, and `size` is the (height, width) of the images, pixels. Every position
+    is used once before a position is used again. Each camera looks at the middle of the person from the smallest
+    distance at which it sees the whole person, or a little farther away. It is rolled by a degree or two, and its
+    principal point is a little off the middle of the image.
     """
     places = AROUND * len(HEIGHTS)
     order = np.concatenate([random.permutation(places) for _ in range(-(-count // places))])[:count]

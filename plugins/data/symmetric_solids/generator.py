@@ -48,7 +48,7 @@ def random_rotations(count: int, generator: torch.Generator) -> Float[Tensor, "c
 def draw_images(
     name: str, turns: Float[Tensor, "sample 4"], size: int, renderer: Renderer
 ) -> UInt8[Tensor, "sample 1 size size"]:
-    """Return images of a solid in the given rotations, from object to camera.
+    """Return images of a solid in the rotations `turns`, unit quaternions of the rotations from object to camera.
 
     The brightness of a surface is (1 + cos α)/2 for the angle α between its normal and the direction to the lamp. The
     lamp moves with the camera, so that a rotation that leaves the solid unchanged leaves its image unchanged.

@@ -113,7 +113,10 @@ def project(
 
 
 def pyramid(cloud: np.ndarray, view: CameraView) -> list[np.ndarray]:
-    """Return for each level the index of the point that each pixel shows, or -1 for pixels that show no point."""
+    """Return for each level the index of the point that each pixel shows, or -1 for pixels that show no point.
+
+    `cloud` is (points, columns); the first columns are x, y, z in the camera's coordinates, metres.
+    """
     depth, index = np.empty(view.size(0), np.float32), np.empty(view.size(0), np.int32)
     compiled.project(cloud, *view.lens, *view.limits, depth, index, None)
     indices = [index]

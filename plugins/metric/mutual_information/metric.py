@@ -59,5 +59,5 @@ class MutualInformation(Metric):
 
 
 def information(total: Tensor, expected: Tensor) -> Tensor:
-    """Return the mutual information, which is 0 where both entropies are the same infinite number."""
+    """Return the mutual information `total` - `expected`, which is 0 where both are the same infinite entropy."""
     return torch.where(total == expected, 0.0, total - expected)

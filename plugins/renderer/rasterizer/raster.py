@@ -129,7 +129,9 @@ def project(vertices, rotation, translation, focal, principal, near, camera_poin
 @compiled
 @no_type_check
 def on_screen(x, y, z, focal, principal, near, row_of_screen):
-    """Fill a row of `screen` (see the module) from the camera coordinates x, y, z of a vertex.
+    """Fill a row of `screen` from the camera coordinates x, y, z of a vertex.
+
+    The docstring of the module describes `screen`, `focal`, `principal` and `near`.
 
     The row is 0 if the vertex cannot be drawn: if it is nearer than `near`, too far away, or not finite.
     """

@@ -155,7 +155,8 @@ def multiply_by_texture(texture, index, w0, w1, w2, image, row, column):
 def shade(camera_points, screen, faces, colors, texture, lens, near, face, box, color, depth):
     """Fill `color` (height, width, channels) and `depth` (height, width), or one of them, at pixels that show a face.
 
-    Depths are clamped to at least `near`, the distance of the near plane in metres.
+    Depths are clamped to at least `near`, the distance of the near plane in metres. The docstrings of this module and
+    of `raster` describe the other arrays.
     """
     top, bottom, left, right = box
     for row in range(top, bottom):
@@ -196,7 +197,10 @@ def shade(camera_points, screen, faces, colors, texture, lens, near, face, box, 
 def fill_surface_channels(
     camera_points, screen, vertices, faces, texture, lens, face, box, normal, barycentric, uv
 ):
-    """Fill `normal`, `barycentric` and `uv`, (height, width, 3 or 2), at pixels that show a face; any may be None."""
+    """Fill `normal`, `barycentric` and `uv`, (height, width, 3 or 2), at pixels that show a face; any may be None.
+
+    The docstrings of this module and of `raster` describe the other arrays.
+    """
     top, bottom, left, right = box
     last = -1
     x = y = z = 0.0

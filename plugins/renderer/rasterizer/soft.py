@@ -137,7 +137,8 @@ def prepare(camera_points, screen, faces, lens, cull, height, width, margin, pos
     """Fill `positions` and `bounds` of `SoftImage`, and return the index of the nearest vertex in view, or -1.
 
     The number of faces with each outcome is added to `counts`, as in `raster.rasterise`. -1 means that no face is in
-    view. `margin` is the result of `blur_margin`. With `cull`, faces seen from behind are left out.
+    view. `margin` is the result of `blur_margin`. With `cull`, faces seen from behind are left out. `raster` describes
+    the arrays `camera_points` and `screen`.
     """
     for vertex in range(camera_points.shape[0]):
         if screen[vertex, 2] != 0:

@@ -27,7 +27,10 @@ def vessel(outer: Sequence[Point], wall: Number, floor: Number, sides: int = 28)
 
 
 def smooth_profile(random: Random, controls: Sequence[Point], steps: int = 14) -> list[tuple[float, float]]:
-    """Return a smooth profile through a few points (radius, height); between them the radius follows a cosine."""
+    """Return a smooth profile through the points `controls` (radius, height); between them the radius follows a cosine.
+
+    `steps` is the number of points of the returned profile.
+    """
     radii, heights = np.array(controls).T
     at = np.linspace(0, len(controls) - 1, steps)
     left = np.minimum(at.astype(int), len(controls) - 2)
