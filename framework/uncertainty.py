@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -102,9 +102,22 @@ class SelfTraining(ABC):
         rows: for each sample of the next prediction, its number among the samples that trained the models, (batch,);
             the wrapper then predicts the sample by the models that did not see it. None: all models predict. The
             attribute is set by `held_out` only.
+        part_count: number of parts of the samples, if each sample belongs to exactly one part, and all models either
+            saw the whole part or no sample of it; 0 if the wrapper divides the samples in another way.
+        left_out: number of a part; all samples of the next prediction are then predicted by the models that did not see
+            this part, also after loading. None: `rows` decides.
     """
 
     rows: Tensor | None = None
+    part_count: int = 0
+    left_out: int | None = None
+
+    def part_of(self, rows: Int[Tensor, "sample"]) -> Int[Tensor, "sample"]:
+        """Return the part to which each of these samples belongs that trained the models.
+
+        It is called after `train_models` of the same object, and only if `part_count` is above 0.
+        """
+        raise NotImplementedError
 
     @abstractmethod
     def train_models(

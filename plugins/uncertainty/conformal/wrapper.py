@@ -3,19 +3,28 @@
 import logging
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
+from framework.calibration.module_flags import evaluation_mode
 from framework.calibration.validation import nonempty_batches, predict_densities, require_numbers
 from framework.data import Batch
-from framework.errors import UserError
+from framework.distributions.protocol import median
+from framework.errors import ConfigError, UserError
 from framework.model import Predictor
-from framework.storage.weights import require_state
-from framework.uncertainty import Uncertainty
+from framework.storage.weights import FINITE, require_state
+from framework.target import Target
+from framework.uncertainty import SelfTraining, Uncertainty, held_out, self_training
+from plugins.uncertainty.conformal.cross_validation import (
+    SAMPLES,
+    IntervalSet,
+    centres_of_parts,
+    cross_validation_interval,
+)
 from plugins.uncertainty.conformal.prediction_set import PredictionSet, Score
 
 SEED = 71
@@ -27,6 +36,8 @@ If the validation split has too few samples for this, `coverage_remark` names th
 """
 NINETY = 1.645
 """Distance from the mean, in standard deviations, within which a normal density has the probability 0.9."""
+MOST_RESIDUALS = 20_000
+"""Largest number of samples whose residuals are stored for "cv_plus"; for so many, split conformal sets are as good."""
 _log = logging.getLogger(__name__)
 
 
@@ -48,39 +59,76 @@ class Conformal(Uncertainty):
         score: "density": one level of density for all inputs, which gives the smallest sets on average; "mass": one
             probability for all inputs, which gives larger sets where the model is uncertain; "quantiles", for one real
             number: the central interval of probability 1 - α, with both ends moved by one distance for all inputs
-            (conformalised quantile regression; Romano, Patterson & Candès 2019).
+            (conformalised quantile regression; Romano, Patterson & Candès 2019). "cv_plus", for one real number around
+            a wrapper that trains models on parts of the samples (`folds`): CV+ intervals from the medians of these
+            models and the residuals of all samples (Barber et al. 2021). They hold the target with a probability of
+            at least 1 - 2α - √(2/n) for n samples, and of about 1 - α if the models hardly depend on single samples.
 
     Attributes:
         threshold: the largest score in a set, nats (for "quantiles" in the unit of the target), a float64 buffer.
+        residuals, parts, count: for "cv_plus", the residual and the part of each sample, and their number, buffers.
 
     Raises:
-        ConfigError: the score is "quantiles", and the target is not one real number.
+        ConfigError: the score is "quantiles" or "cv_plus", and the target is not one real number; or it is "cv_plus",
+            and no wrapper inside trains models on parts of the samples, or there are too many samples.
         UserError: there are fewer than 2 validation samples, or a score is NaN (the message names the samples).
     """
 
-    bibtex = "vovk2005algorithmic, sadinle2019least, romano2020classification, romano2019conformalized"
+    bibtex = (
+        "vovk2005algorithmic, sadinle2019least, romano2020classification, romano2019conformalized, "
+        "barber2021predictive"
+    )
     threshold: Tensor
+    residuals: Tensor
+    parts: Tensor
+    count: Tensor
 
     def __init__(
         self,
         model: Callable[[], Predictor],
+        target: Target,
         *,
         miscoverage: Annotated[float, Field(gt=0, lt=1)] = 0.1,
-        score: Score = "density",
+        score: Score | Literal["cv_plus"] = "density",
     ) -> None:
         super().__init__()
         self.model = model()
         self.miscoverage = miscoverage
-        self.score: Score = score
+        self.score: Score | Literal["cv_plus"] = score
+        if score == "cv_plus":
+            target.require("real", by="uncertainty.conformal.score=cv_plus")
+            parted_wrapper(self.model)
+            if len(target.names) != 1:
+                raise ConfigError(
+                    f"uncertainty.conformal.score=cv_plus gives intervals of one real number, but the target is "
+                    f"{target.listed_names}. Choose score=density or score=mass."
+                )
+            self.register_buffer("residuals", torch.zeros(MOST_RESIDUALS, dtype=torch.float64))
+            self.register_buffer("parts", torch.zeros(MOST_RESIDUALS, dtype=torch.int64))
+            self.register_buffer("count", torch.zeros((), dtype=torch.int64))
+            last = float(parted_wrapper(self.model).part_count - 1)
+            require_state(self, residuals=FINITE, parts=(0.0, last), count=(0.0, float(MOST_RESIDUALS)))
         self.register_buffer("threshold", torch.tensor(math.inf, dtype=torch.float64))
         require_state(self, threshold=(-math.inf, math.inf))
 
-    def forward(self, inputs: Tensor) -> PredictionSet:
+    def forward(self, inputs: Tensor) -> PredictionSet | IntervalSet:
         """Return the density for each input with its prediction set."""
+        if self.score == "cv_plus":
+            centres = centres_of_parts(self.model, parted_wrapper(self.model), inputs)
+            known = slice(int(self.count))
+            residuals = self.residuals[known].double()
+            ends = cross_validation_interval(centres, residuals, self.parts[known], self.miscoverage)
+            return IntervalSet(self.model(inputs), *ends, 1 - self.miscoverage)
         return PredictionSet(self.model(inputs), self.threshold, self.score, 1 - self.miscoverage)
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
-        """Calibrate the wrapped model on one half of the samples, and fit the threshold to the other half."""
+        """Calibrate the wrapped model on one half of the samples, and fit the threshold to the other half.
+
+        With "cv_plus" all samples calibrate the wrapped model, and the residuals of all samples are stored.
+        """
+        if self.score == "cv_plus":
+            self._store_residuals(nonempty_batches(batches, by="conformal"))
+            return
         model_half, own_half = split_in_halves(nonempty_batches(batches, by="conformal"))
         if not own_half:
             raise UserError(
@@ -88,8 +136,9 @@ class Conformal(Uncertainty):
                 "are required, but got one sample. Give the data set a larger validation split."
             )
         self.model.calibrate(model_half)
+        score = self.score
         sets = [
-            PredictionSet(density, self.threshold, self.score, 1 - self.miscoverage)
+            PredictionSet(density, self.threshold, score, 1 - self.miscoverage)
             for density in predict_densities(self.model, own_half)
         ]
         scores = torch.cat(
@@ -110,6 +159,58 @@ class Conformal(Uncertainty):
                 self.miscoverage,
                 math.ceil(1 / self.miscoverage) - 1,
             )
+
+    @torch.no_grad()
+    def _store_residuals(self, batches: Sequence[Batch]) -> None:
+        wrapper = parted_wrapper(self.model)
+        self.model.calibrate(batches)
+        if not all("row" in batch for batch in batches):
+            self.count.fill_(0)
+            self.remark = (
+                "conformal: every set holds all values, because score=cv_plus needs the samples on which the models "
+                "were trained: each residual is computed by the models that did not see the sample. Train the model "
+                "with this wrapper (uncertainty=[folds,conformal]), or choose another score for mode=calibrate."
+            )
+            _log.warning("%s", self.remark)
+            return
+        residuals, parts = [], []
+        with evaluation_mode(self.model):
+            for batch in batches:
+                with held_out(self.model, batch):
+                    centre = median(self.model(batch["input"]), SAMPLES)
+                residuals.append((batch["target"].double() - centre.double()).abs().squeeze(-1))
+                parts.append(wrapper.part_of(batch["row"]).to(self.parts))
+        errors = torch.cat(residuals)
+        require_numbers(errors, batches, "residual")
+        if len(errors) > MOST_RESIDUALS:
+            raise ConfigError(
+                f"uncertainty.conformal.score=cv_plus stores the residuals of at most {MOST_RESIDUALS:,} samples, but "
+                f"there are {len(errors):,}. Choose score=density, mass or quantiles."
+            )
+        self.residuals[: len(errors)] = errors
+        self.parts[: len(errors)] = torch.cat(parts)
+        self.count.fill_(len(errors))
+        bound = 1 - 2 * self.miscoverage - math.sqrt(2 / len(errors))
+        self.remark = (
+            f"conformal: CV+ intervals from the residuals of {len(errors)} samples. They hold at least "
+            f"{100 * max(0.0, bound):.3g} % of the targets if no model uses the samples that it left out, "
+            f"and in practice about {100 * (1 - self.miscoverage):g} %."
+        )
+
+
+def parted_wrapper(model: Predictor) -> SelfTraining:
+    """Return the wrapper inside a predictor that trains models on all but a part of the samples.
+
+    Raises:
+        ConfigError: there is no such wrapper.
+    """
+    wrapper = self_training(model)
+    if wrapper is None or not wrapper.part_count:
+        raise ConfigError(
+            "uncertainty.conformal.score=cv_plus needs models that each left out a part of the samples, but no wrapper "
+            "inside conformal trains such models. Write uncertainty=[folds,conformal], or choose another score."
+        )
+    return wrapper
 
 
 def split_in_halves(batches: Sequence[Batch]) -> tuple[list[Batch], list[Batch]]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Annotated
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor
 from torch.distributions import Distribution
@@ -86,7 +86,7 @@ class Folds(Uncertainty, SelfTraining):
                 "of the same length."
             )
         self.knobs = {}
-        self.folds = folds
+        self.folds = self.part_count = folds
         self.schedule = Schedule(steps, epochs, learning_rate, tuple(weight_decay))
         self.models = build_models([model() for _ in range(folds * len(dropout))], dropout)
         if not any(parameter.requires_grad for parameter in self.parameters()):
@@ -119,13 +119,24 @@ class Folds(Uncertainty, SelfTraining):
             like = next(self.parameters())
             dtype = like.dtype if like.dtype.itemsize >= 4 else torch.float32
             log_weights = torch.zeros(components.batch_shape, dtype=dtype, device=like.device)
-            if self.rows is not None:
-                assert self._fold is not None
-                fold = self._fold[self.rows.cpu()].to(like.device)
+            fold = self._left_out_fold(components.batch_shape[0])
+            if fold is not None:
+                fold = fold.to(like.device)
                 log_weights.fill_(-math.inf).scatter_(1, fold.unsqueeze(1), 0.0)
             mixtures.append(Mixture(log_weights, components))
             mixtures[-1].over_models = True
         return mixtures
+
+    def _left_out_fold(self, count: int) -> Int[Tensor, "sample"] | None:
+        """Return, for each sample of the next prediction, the fold that its models left out; None for all models."""
+        if self.left_out is not None:
+            return torch.full((count,), self.left_out)
+        return None if self.rows is None else self.part_of(self.rows)
+
+    def part_of(self, rows: Int[Tensor, "sample"]) -> Int[Tensor, "sample"]:
+        """Return the fold of each of these samples that trained the models."""
+        assert self._fold is not None
+        return self._fold[rows.cpu()]
 
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
         """Return the mean loss of all models for each sample, nats.
