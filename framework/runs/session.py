@@ -419,7 +419,8 @@ def rehearse(session: Session) -> None:
         return
     seed_step(session.settings.seed, 0, "rehearsal")
     training = session.predictor.training
-    density = session.predictor.eval()(validation_batch["input"])
+    with silence():  # before calibration, a wrapper may warn that its results mean nothing
+        density = session.predictor.eval()(validation_batch["input"])
     session.predictor.train(training)
     samples = session.settings.samples
     predictions = [Prediction(density, validation_batch, samples)]

@@ -30,12 +30,14 @@ class Clusters(NamedTuple):
         counts: number of samples of each class, (class,) int64.
         whitening: W with WᵀW = Σ⁻¹, (feature, feature) float64.
         shrinkage: share of the multiple of the identity in Σ.
+        covariance: Σ, (feature, feature) float64.
     """
 
     means: Tensor
     counts: Tensor
     whitening: Tensor
     shrinkage: float
+    covariance: Tensor
 
 
 def fit_clusters(parts: Parts, classes: int, shrinkage: float | None) -> Clusters:
@@ -65,7 +67,26 @@ def fit_clusters(parts: Parts, classes: int, shrinkage: float | None) -> Cluster
         fourth += residual.square().sum(1).square().sum().item()
     empirical = scatter / count
     share = ledoit_wolf_share(empirical, fourth, count) if shrinkage is None else shrinkage
-    return Clusters(means, counts, whiten(empirical, share), share)
+    identity = torch.eye(size, dtype=empirical.dtype, device=empirical.device)
+    covariance = (1 - share) * empirical + share * empirical.diagonal().mean() * identity
+    return Clusters(means, counts, whiten(empirical, share), share, covariance)
+
+
+def merge_clusters(clusters: Clusters) -> Clusters:
+    """Return the mean and the covariance of all classes together, as one class, by the law of total covariance.
+
+    With the means μ_c, their mean μ over all samples, and n_c of N samples, the covariance is Σ + Σ_c n_c/N (μ_c - μ)
+    (μ_c - μ)ᵀ. Without shrinkage it is the empirical covariance of all samples, as in Ren et al. 2021. A shrinkage of
+    its own would be another one than that of Σ. In directions in which the training samples hardly vary, one of the
+    two distances would then be many times the other, whatever the classes are.
+    """
+    shares = clusters.counts.to(clusters.means) / clusters.counts.sum()
+    mean = shares @ clusters.means
+    differences = clusters.means - mean
+    between = (differences.T * shares) @ differences
+    whole = clusters.covariance + between
+    counts = clusters.counts.sum().reshape(1)
+    return Clusters(mean.unsqueeze(0), counts, whiten(whole, 0.0), clusters.shrinkage, whole)
 
 
 def ledoit_wolf_share(empirical: Float[Tensor, "feature feature"], fourth: float, count: int) -> float:

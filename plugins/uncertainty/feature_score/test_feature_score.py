@@ -24,6 +24,7 @@ from plugins.uncertainty.feature_score.statistics import (
     energy,
     fit_clusters,
     mahalanobis,
+    merge_clusters,
     neighbour_distance,
     to_unit_length,
 )
@@ -103,6 +104,22 @@ def test_the_relative_distance_subtracts_that_of_one_normal_density():
     np.testing.assert_allclose(score_of(wrapper, new), classes - everything, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("shrinkage", [None, 1e-6, 0.5])
+def test_the_relative_distance_differs_from_0_along_the_class_means_only(shrinkage):
+    """Check that Σ⁻¹ - Σ_all⁻¹ has no negative eigenvalue, and K - 1 positive ones for K classes."""
+    inputs, label = labelled(count=60)
+    scales = torch.logspace(0, -4, 16, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(2)
+    wide = torch.cat([inputs, torch.randn(60, 16, generator=generator, dtype=torch.float64) * scales], 1)
+    clusters = fit_clusters(lambda: iter([(wide, label)]), 4, shrinkage)  # one class has no samples
+    merged = merge_clusters(clusters)
+    np.testing.assert_allclose(merged.means[0], wide.mean(0), rtol=1e-12)
+    inverse, inverse_of_all = (part.whitening.T @ part.whitening for part in (clusters, merged))
+    values = torch.linalg.eigvalsh(inverse - inverse_of_all) / torch.linalg.eigvalsh(inverse)[-1]
+    assert values[0] > -1e-9
+    assert (values > 1e-9).sum() == 2
+
+
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-5), (torch.float64, 1e-12)])
 @pytest.mark.parametrize("normalise", [None, True, False])
 def test_neighbour_distances_equal_scikit_learns(dtype, tolerance, normalise):
@@ -129,6 +146,23 @@ def test_energy_equals_scipys_logsumexp_also_of_large_logits(dtype, tolerance):
     raw = wrapper.model.raw(inputs).detach().double().numpy()
     np.testing.assert_allclose(score_of(wrapper, inputs), -logsumexp(raw, axis=1), rtol=tolerance)
     assert torch.equal(before, score_of(wrapper, inputs))
+
+
+@pytest.mark.parametrize("method", ["mahalanobis", "relative_mahalanobis", "knn", "energy"])
+def test_scores_before_calibration_are_reported_once(method, caplog):
+    inputs, label = labelled()
+    wrapper = wrapper_around(method=method)
+    for _ in range(2):
+        score_of(wrapper, inputs)
+    warned = [record.message for record in caplog.records if "was not calibrated" in record.message]
+    assert len(warned) == (method != "energy")
+    caplog.clear()
+    calibrated, loaded = wrapper_around(method=method), wrapper_around(method=method)
+    calibrated.calibrate(as_batches(inputs, label))
+    loaded.load_state_dict(calibrated.state_dict())
+    assert score_of(loaded, inputs).abs().sum() > 0
+    score_of(calibrated, inputs)
+    assert not caplog.records
 
 
 def test_statistics_come_from_the_training_split_in_any_batches():

@@ -1,5 +1,6 @@
 """Outlier scores from the features in front of the final layer, beside an unchanged density."""
 
+import logging
 from collections.abc import Callable, Iterable, Iterator
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -25,6 +26,7 @@ from plugins.uncertainty.feature_score.statistics import (
     energy,
     fit_clusters,
     mahalanobis,
+    merge_clusters,
     neighbour_distance,
     to_unit_length,
 )
@@ -36,6 +38,13 @@ MOST_STORED = 2**26
 """Largest number of features of all stored training samples together (256 MiB in a checkpoint)."""
 NEIGHBOURS, REFERENCES = 50, 5000
 """Defaults of `neighbours` and `references`."""
+UNCALIBRATED = (
+    "feature_score: the statistics of the training data are missing, because the model was not calibrated, so every "
+    "outlier score is 0 and says nothing. Use the model that a run writes at its end (checkpoints/model.ckpt), or run "
+    "mode=calibrate."
+)
+"""Warning before `calibrate`, for methods that need statistics."""
+_log = logging.getLogger(__name__)
 
 
 class FeatureScore(Uncertainty, ReadsTraining):
@@ -46,14 +55,14 @@ class FeatureScore(Uncertainty, ReadsTraining):
     - "mahalanobis": squared Mahalanobis distance from the nearest class, with one covariance for all classes (Lee et
       al. 2018). A target that is no class counts as a single class.
     - "relative_mahalanobis": this distance minus the distance in the normal density of all classes together (Ren et al.
-      2021).
+      2021), whose covariance has the shrinkage of the first one.
     - "knn": distance from the k-th nearest of the stored training samples (Sun et al. 2022).
     - "energy": -log Σ exp of the logits (Liu et al. 2020), which needs no statistics of training samples.
 
     `calibrate` computes the statistics from the training split. If there is no training split, it uses the samples that
-    it is given. Before `calibrate`, the scores of distances are 0. `framework.distributions.unchanged.outlier_score`
-    reads the score of a density. A wrapper around this one drops the scores, unless it leaves the density unchanged
-    too.
+    it is given. Before `calibrate`, the scores of distances are 0, and a warning says so.
+    `framework.distributions.unchanged.outlier_score` reads the score of a density. A wrapper around this one drops the
+    scores, unless it leaves the density unchanged too.
 
     Args:
         method: one of the methods above.
@@ -111,6 +120,7 @@ class FeatureScore(Uncertainty, ReadsTraining):
                 "samples are stored (references). Lower neighbours or raise references."
             )
         self._register(network_of(self.model).layer.in_features)
+        self._warned = False
 
     def _register(self, features: int) -> None:
         """Register the buffers of the method's statistics.
@@ -148,7 +158,16 @@ class FeatureScore(Uncertainty, ReadsTraining):
         if self.training:
             return self.model(inputs)
         passed = run_network(self.model, inputs)
+        if not self._warned and self.method != "energy":
+            self._warned = True
+            if not self._calibrated:
+                _log.warning("%s", UNCALIBRATED)
         return ScoredDensity(passed.density, self._score(passed.features, passed.raw))
+
+    @property
+    def _calibrated(self) -> bool:
+        """True if `calibrate` has computed the statistics, or a checkpoint with statistics was loaded."""
+        return bool(self.get_buffer("count" if self.method == "knn" else "counts").sum() > 0)
 
     def _score(
         self, features: Float[Tensor, "batch feature"], raw: Float[Tensor, "batch raw"]
@@ -190,12 +209,11 @@ class FeatureScore(Uncertainty, ReadsTraining):
                 self._fit(kept_batches if self.training_split is None else self.training_split)
 
     def _fit(self, batches: Iterable[Batch]) -> None:
-        def parts(*, one_class: bool = False) -> Iterator[tuple[Tensor, Tensor]]:
+        def parts() -> Iterator[tuple[Tensor, Tensor]]:
             for batch in batches:
                 features = self._prepare(run_network(self.model, batch["input"]).features)
-                single = one_class or self.classes == 1
                 label = torch.zeros(len(features), dtype=torch.int64, device=features.device)
-                yield features, label if single else batch["target"]
+                yield features, label if self.classes == 1 else batch["target"]
 
         if self.method == "knn":
             chosen = choose_samples(parts, self.references)
@@ -211,7 +229,7 @@ class FeatureScore(Uncertainty, ReadsTraining):
         clusters = fit_clusters(parts, self.classes, self.shrinkage)
         self._store(clusters, "")
         if self.method == "relative_mahalanobis":
-            self._store(fit_clusters(lambda: parts(one_class=True), 1, self.shrinkage), "_of_all")
+            self._store(merge_clusters(clusters), "_of_all")
         self.remark = (
             f"feature_score: {int(clusters.counts.sum())} training samples in {int((clusters.counts > 0).sum())} "
             f"classes; shrinkage of the covariance {clusters.shrinkage:.3g}."
