@@ -195,3 +195,22 @@ def test_the_help_fits_80_columns_and_names_every_option(
     words = set(re.findall(r"[\w]+", text))
     for group in groups():
         assert {name.rpartition("/")[2] for name in options(group)} <= words
+
+
+EXEMPTED = """
+import gc
+from framework.storage.imports import without_collection
+kept, counts = [], []
+for _ in range(2):
+    with without_collection():
+        kept += [[] for _ in range(1000)]
+        collecting = gc.isenabled()
+    counts.append(gc.get_freeze_count())
+print(collecting, gc.isenabled(), counts[0] >= 1000, abs(counts[1] - counts[0]) < 500)
+"""
+
+
+def test_only_what_the_first_imports_leave_is_exempt_from_collection() -> None:
+    """Otherwise a sweep that runs its jobs in one process would keep the unused objects of every job."""
+    done = subprocess.run([sys.executable, "-c", EXEMPTED], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "True", "True", "True"]
