@@ -11,6 +11,7 @@ import json
 import math
 import sys
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
@@ -24,6 +25,7 @@ from torch import Tensor
 import framework
 from benchmarks.commands import ROOT, carry_out
 from benchmarks.pages import machine, publish
+from benchmarks.timing import time_interleaved
 from framework.configuration.schema import build, resolve
 from framework.datasets.fields import fetch
 from framework.figures.style import COLOURS, GREY, MARKERS, save_figure, titled_figure
@@ -31,8 +33,13 @@ from framework.geometry import quaternions
 from framework.geometry.rotation_grid import centres, points_in
 from framework.geometry.symmetry import GROUPS, log_blurred
 
-METHODS = ("matrix_fisher", "rotation_laplace", "mixture", "scvae", "implicit_pdf")
+METHODS = (
+    *("von_mises", "projected_normal", "matrix_fisher", "rotation_laplace"),
+    *("mixture", "scvae", "implicit_pdf"),
+)
 NAMES = {
+    "von_mises": "von Mises angles",
+    "projected_normal": "projected normal angles",
     "matrix_fisher": "matrix Fisher",
     "rotation_laplace": "rotation Laplace",
     "mixture": "mixture of 24 matrix Fisher",
@@ -41,6 +48,8 @@ NAMES = {
 }
 SOLIDS = ("tetrahedron", "cube", "cone", "cylinder")
 SEEDS = (0, 1, 2)
+BATCH = 64
+"""Number of test images of the batch whose run time is measured."""
 NEAR = 0.3
 """Largest distance from the optimum at which the aim is reached, nats."""
 RUNS = ROOT / "outputs" / "sweeps" / "symmetric_solids"
@@ -82,6 +91,42 @@ def read_runs() -> dict[str, list[tuple[Path, Mapping[str, Any]]]]:
     return runs
 
 
+@torch.no_grad()
+def measure_costs(runs: Mapping[str, list[tuple[Path, Mapping[str, Any]]]]) -> dict[str, float]:
+    """Return the processor time of a density and its log-density for each method, ms per image, on one thread.
+
+    The methods are timed in interleaved rounds, so that other work on the machine affects all of them.
+    """
+    torch.set_num_threads(1)
+    first = next(iter(runs.values()))[0][0]
+    config = yaml.safe_load((first / "config.yaml").read_text(encoding="utf-8"))
+    data = build("data", resolve("data", config["data"]))
+    data.prepare()
+    batch = fetch(data.splits().test, range(BATCH))
+    models = {method: framework.load(str(chosen[0][0])) for method, chosen in runs.items()}
+
+    def predict(method: str) -> object:
+        return models[method](batch["input"]).log_prob(batch["target"])
+
+    calls = {method: partial(predict, method) for method in runs}
+    return {method: rounds.median / BATCH for method, rounds in time_interleaved(calls, seconds=0.1).items()}
+
+
+def winners(runs: Mapping[str, list[tuple[Path, Mapping[str, Any]]]], costs: Mapping[str, float]) -> str:
+    """Return the sentence that says which method is nearest to the exact density at which run time."""
+    gaps = {method: mean(results["optimum_gap"] for _, results in chosen) for method, chosen in runs.items()}
+    best, parts = math.inf, []
+    for method in sorted(runs, key=lambda method: costs[method]):
+        if gaps[method] < best:
+            best = gaps[method]
+            parts.append(f"{NAMES[method]} from {costs[method]:.2g} ms per image on ({best:.2f} nats)")
+    beaten = [NAMES[method] for method in runs if not any(NAMES[method] in part for part in parts)]
+    return (
+        f"the nearest to the exact density is {', and '.join(parts)}. Each of the other methods "
+        f"({', '.join(beaten)}) is slower than one of these and not nearer."
+    )
+
+
 def with_error(values: list[float], errors: list[float]) -> str:
     """Return the mean over seeds with the standard deviation, or for one seed with its standard error over images."""
     spread = stdev(values) if len(values) > 1 else errors[0]
@@ -104,7 +149,9 @@ def minutes(folder: Path) -> float:
     return ((folder / "results.json").stat().st_mtime - started) / 60
 
 
-def tables(runs: Mapping[str, list[tuple[Path, Mapping[str, Any]]]]) -> tuple[list[str], list[str]]:
+def tables(
+    runs: Mapping[str, list[tuple[Path, Mapping[str, Any]]]], costs: Mapping[str, float]
+) -> tuple[list[str], list[str]]:
     """Return the tables of log-likelihoods and of spreads."""
     head = f"| method | seeds | all | {' | '.join(SOLIDS)} |"
     rule = "|---|---:|" + "---:|" * (1 + len(SOLIDS))
@@ -112,7 +159,7 @@ def tables(runs: Mapping[str, list[tuple[Path, Mapping[str, Any]]]]) -> tuple[li
     spread = [head, rule]
     for method, chosen in runs.items():
         cells = result_cells(chosen, "rotation_log_likelihood")
-        cost = mean(results["milliseconds_per_sample"] for _, results in chosen)
+        cost = costs[method]
         time = mean(minutes(folder) for folder, _ in chosen)
         likelihood.append(
             f"| {NAMES[method]} | {len(chosen)} | {' | '.join(cells)} | {cost:.1f} | {time:.0f} |"
@@ -128,13 +175,9 @@ def tables(runs: Mapping[str, list[tuple[Path, Mapping[str, Any]]]]) -> tuple[li
     return likelihood, spread
 
 
-def conclusion(runs: Mapping[str, list[tuple[Path, Mapping[str, Any]]]]) -> str:
+def conclusion(runs: Mapping[str, list[tuple[Path, Mapping[str, Any]]]], costs: Mapping[str, float]) -> str:
     """Return the sentences about the best method, its distance from the optimum, and its cost."""
     gaps = {method: mean(results["optimum_gap"] for _, results in chosen) for method, chosen in runs.items()}
-    costs = {
-        method: mean(results["milliseconds_per_sample"] for _, results in chosen)
-        for method, chosen in runs.items()
-    }
     ranked = sorted(gaps, key=lambda method: gaps[method])
     best, fastest = ranked[0], min(ranked, key=lambda method: costs[method])
     by_solid = {
@@ -201,7 +244,7 @@ def draw(runs: Mapping[str, list[tuple[Path, Mapping[str, Any]]]]) -> None:
     ]
     columns = [("exact density", torch.stack(exact).exp().numpy())]
     shown = [
-        method for method in METHODS if method in runs and method not in ("matrix_fisher", "rotation_laplace")
+        method for method in METHODS if method in runs and method in ("mixture", "scvae", "implicit_pdf")
     ]
     columns += [
         (NAMES[method], densities_on_grid(runs[method][0][0], every["input"][rows])) for method in shown
@@ -244,23 +287,38 @@ def draw(runs: Mapping[str, list[tuple[Path, Mapping[str, Any]]]]) -> None:
     save_figure(figure, Path(__file__).resolve().with_suffix(""), "png")
 
 
-def draw_cost(runs: Mapping[str, list[tuple[Path, Mapping[str, Any]]]]) -> None:
-    """Draw the distance from the exact density against the time of a prediction, with a point for each method."""
+def draw_cost(runs: Mapping[str, list[tuple[Path, Mapping[str, Any]]]], costs: Mapping[str, float]) -> None:
+    """Draw the distance from the exact density against the time of a prediction, with a point for each method.
+
+    A line shows the best distance at each run time.
+    """
     figure = titled_figure((7.0, 3.4), "Distance from the exact density", synthetic=True)
     axes = figure.add_subplot()
     for number, (method, chosen) in enumerate(runs.items()):
         gaps = [results["optimum_gap"] for _, results in chosen]
         error = stdev(gaps) if len(gaps) > 1 else chosen[0][1]["optimum_gap_sem"]
-        cost = mean(results["milliseconds_per_sample"] for _, results in chosen)
         axes.errorbar(
-            cost, mean(gaps), error, marker=MARKERS[number], color=COLOURS[number], label=NAMES[method], ls=""
+            *(costs[method], mean(gaps), error),
+            marker=MARKERS[number],
+            color=COLOURS[number],
+            label=NAMES[method],
+            ls="",
         )
+    ranked = sorted(
+        (costs[method], mean(results["optimum_gap"] for _, results in chosen))
+        for method, chosen in runs.items()
+    )
+    best = np.minimum.accumulate([gap for _, gap in ranked])
+    times = [cost for cost, _ in ranked]
+    axes.step(
+        [*times, 3 * times[-1]], [*best, best[-1]], where="post", color=GREY, zorder=0, label="best so far"
+    )
     axes.axhline(NEAR, color=GREY, linestyle=":", label=f"aim: {NEAR} nats")
     axes.set(xscale="log", xlabel="milliseconds per image", ylabel="nats below exact density", ylim=(0, None))
     axes.xaxis.set_major_locator(FixedLocator([0.1, 0.3, 1, 3, 10, 30, 100]))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.margins(x=0.2)
+    axes.set_xlim(times[0] / 2, 2 * times[-1])
     figure.legend(*axes.get_legend_handles_labels(), loc="outside right center")
     save_figure(figure, Path(__file__).resolve().with_name("symmetric_solids_cost"), "png")
 
@@ -273,8 +331,9 @@ def page() -> None:
             f"{RUNS} holds no finished run. Run `python -m benchmarks.pose.symmetric_solids train` first."
         )
     draw(runs)
-    draw_cost(runs)
-    likelihood, spread = tables(runs)
+    costs = measure_costs(runs)
+    draw_cost(runs, costs)
+    likelihood, spread = tables(runs, costs)
     newline = "\n"
     missing = [NAMES[method] for method in METHODS if method not in runs]
     unmeasured = f"\nThese methods were not measured: {', '.join(missing)}.\n" if missing else ""
@@ -294,11 +353,14 @@ et al. 2021. Higher is better.
 
 {newline.join(likelihood)}
 
-{conclusion(runs)}
+{conclusion(runs, costs)}
+
+**Which method wins at which run time:** {winners(runs, costs)}
 {unmeasured}
 ± is the standard deviation over seeds of the training, or for a single seed the standard error over the test images.
-The times are those of one thread while other work ran on the machine: "ms / image" is the time of a prediction and its
-log-density in batches of 64, "minutes" the whole command with training and test. Every method has the same network and
+"ms / image" is the processor time of a prediction and its log-density in batches of {BATCH} on one thread, measured for
+all methods in interleaved rounds. "minutes" is the whole command with training and test, on one thread while other work
+ran on the machine. Every method has the same network and
 the same 8 epochs (2,500 steps); Murphy et al. 2021 train for 100,000 steps.
 
 ![Distance from the exact density against milliseconds per image](symmetric_solids_cost.png)

@@ -305,7 +305,12 @@ class Training(pl.LightningModule):
         epoch = math.ceil(batches / trainer.accumulate_grad_batches)
         epochs = max(1, trainer.max_epochs or 1)
         schedule = next(
-            (each for each in trainer.callbacks if isinstance(each, GradientAccumulationScheduler)), None
+            (
+                callback
+                for callback in trainer.callbacks
+                if isinstance(callback, GradientAccumulationScheduler)
+            ),
+            None,
         )
         steps = epoch * epochs
         if schedule is not None:
