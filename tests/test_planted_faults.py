@@ -17,6 +17,7 @@ from framework.testing.precision import reference
 from plugins.density_head.latent.decoder import LatentDecoder
 from plugins.density_head.latent.rows import ROWS
 from plugins.density_head.von_mises.density import VonMises
+from tests.conftest import first_of_each
 from tests.planted_faults import ALL_FAULTS
 from tests.planted_heads import CLASSES, HEIGHT, IMAGE, ONE, PLACE, THREE, TWO, Fault
 from tests.planted_questions import FURTHER_FAULTS
@@ -26,7 +27,9 @@ ALONE = {fault.only.rpartition(": ")[2] for fault in (*ALL_FAULTS, *FURTHER_FAUL
 """Names of the properties that the planted faults break, without the structure (mixture, power) of the density."""
 
 
-@pytest.mark.parametrize("fault", ALL_FAULTS, ids=lambda fault: fault.name)
+@pytest.mark.parametrize(
+    "fault", first_of_each(ALL_FAULTS, lambda fault: fault.only or fault.name, lambda fault: fault.name)
+)
 def test_the_fault_is_found(fault: Fault) -> None:
     failed = (finding.name for finding in fault.findings() if not finding.holds)
     first = next(failed, None)

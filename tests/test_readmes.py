@@ -16,6 +16,7 @@ from framework.configuration.command_line import command_line
 from framework.configuration.composition import folder, plain, register
 from framework.configuration.config import Config
 from framework.modes import MODES
+from tests.conftest import first_of_each
 from tests.test_composition import EXPERIMENTS
 
 ROOT = Path(__file__).parent.parent
@@ -63,13 +64,29 @@ def jobs(command: str) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("readme, command", ALL, ids=[f"{one.parent.name}: {said[:60]}" for one, said in ALL])
+def distinct() -> list[tuple[Path, str]]:
+    """Return each command once, without those that test_composition.py composes: those with an experiment alone."""
+    first: dict[tuple[str, ...], tuple[Path, str]] = {}
+    for readme, command in ALL:
+        arguments = tuple(jobs(command))
+        if len(arguments) > 1 or arguments[0].removeprefix("experiment=") not in EXPERIMENTS:
+            first.setdefault(arguments, (readme, command))
+    return list(first.values())
+
+
+def keys(case: tuple[Path, str]) -> frozenset[str]:
+    """Return the keys that a command sets."""
+    return frozenset(word.partition("=")[0] for word in jobs(case[1]))
+
+
+@pytest.mark.parametrize(
+    "readme, command",
+    first_of_each(distinct(), keys, lambda case: f"{case[0].parent.name}: {case[1][:60]}"),
+)
 def test_a_command_of_a_readme_composes(
     readme: Path, command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     arguments = jobs(command)
-    if len(arguments) == 1 and arguments[0].removeprefix("experiment=") in EXPERIMENTS:
-        return  # test_composition.py composes every experiment
     monkeypatch.setattr(composition, "config_folders", FOLDERS)
     register()
     try:
