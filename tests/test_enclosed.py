@@ -2,13 +2,21 @@
 
 import os
 import socket
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from framework.configuration.newest import newest_run
 from framework.errors import CheckpointError, ConfigError, DataError
-from framework.storage.enclosed import open_plain, read_plain, require_enclosed, require_plain_within
+from framework.storage.enclosed import (
+    DEEPEST_FOLDERS,
+    open_plain,
+    read_plain,
+    require_enclosed,
+    require_plain_within,
+)
 from framework.tracking import journal as journals
 from framework.tracking.journal import Journal
 
@@ -102,6 +110,27 @@ def test_a_folder_may_be_reached_by_a_link_that_the_user_names(tmp_path: Path) -
     (tmp_path / "file").touch()
     with pytest.raises(DataError, match="is not a folder"):
         require_enclosed(tmp_path / "file")
+
+
+def test_folders_nested_deeper_than_python_can_walk_are_refused(tmp_path: Path) -> None:
+    """Python's `os.walk` and `Path.rglob` fail at a few hundred levels."""
+    run = tmp_path / "run"
+    checkpoints = run / "/".join("a" * DEEPEST_FOLDERS)
+    checkpoints.mkdir(parents=True)
+    require_enclosed(run)
+    folder = os.open(checkpoints, os.O_RDONLY)
+    for _ in range(1200):
+        os.mkdir("a", dir_fd=folder)
+        inner = os.open("a", os.O_RDONLY, dir_fd=folder)
+        os.close(folder)
+        folder = inner
+    os.close(folder)
+    for error in (DataError, ConfigError):
+        with pytest.raises(error, match=r"nested more than 64 levels deep.* Give the folder of a run\.$"):
+            require_enclosed(run, error)
+    with pytest.raises(CheckpointError, match="no run in that folder has a checkpoint"):
+        newest_run(run)
+    subprocess.run(["rm", "-r", run], check=True)  # pytest cannot remove it
 
 
 def test_a_link_to_a_folder_on_the_way_is_refused(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from framework.sweeps.results import read_results
 from framework.tracking.journal import _record
 from framework.tracking.run_info import SIDECAR, RunInfo, read_run_info
 
-NO_NUMBERS = [True, "1_0", "nan", "0x10", " 1 ", "1", None, [], {}]
+NO_NUMBERS = [True, "1_0", "nan", "0x10", " 1 ", "1", None, [], {}, 10**400]
 """Values that are not numbers, although Python or NumPy converts most of them to one."""
 CAMERA = {"K": [[10.0, 0, 5], [0, 10, 5], [0, 0, 1]], "R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "t": [0, 0, 2]}
 
@@ -162,7 +162,7 @@ where one may stand, and in configs plain digits, which a variable of the enviro
 
 
 @pytest.mark.parametrize("reader", READERS)
-@pytest.mark.parametrize("value", NO_NUMBERS, ids=repr)
+@pytest.mark.parametrize("value", NO_NUMBERS, ids=lambda value: repr(value)[:9])
 def test_what_is_no_number_is_refused(reader: str, value: Any, tmp_path: Path) -> None:
     if value in TAKEN.get(reader, []) and not isinstance(value, bool):
         READERS[reader](tmp_path, value)

@@ -304,7 +304,7 @@ def test_a_plugins_command_does_nothing_but_say_a_sentence(
         listener.accept()
 
 
-WRONG = [None, -1, "", "\x1b[2J$\\frac{", [], {"a": {"b": [None]}}]
+WRONG = [None, -1, 10**400, "", "\x1b[2J$\\frac{", [], {"a": {"b": [None]}}]
 RESULTS = {
     "method": "m",
     "data": "d",
@@ -315,6 +315,7 @@ RESULTS = {
     "columns": {"nll": "NLL"},
     "better": {"nll": "lower"},
     "nll": 1.0,
+    "nll_sem": 0.1,
     "synthetic": True,
     "folder": "/etc",
 }

@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 from framework.errors import CheckpointError
+from framework.storage.enclosed import DEEPEST_FOLDERS
 
 LAST = "last"
 MODELS = ("model.ckpt", "best.ckpt", "last.ckpt", "previous.ckpt")
@@ -21,6 +22,8 @@ def newest_run(outputs: Path) -> Path:
         times = [(folder / file).lstat().st_mtime for file in files if file in MODELS]
         if folder.name == "checkpoints" and times:
             written[folder.parent] = max(times)
+            below.clear()
+        if len(folder.relative_to(outputs).parts) > DEEPEST_FOLDERS:
             below.clear()
     if not written:
         raise CheckpointError(

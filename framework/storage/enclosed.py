@@ -15,6 +15,8 @@ from framework.errors import DataError, UserError, shorten
 
 MOST_ENTRIES = 1_000_000
 """Largest number of files and folders in a run or sweep folder; a folder with more is refused."""
+DEEPEST_FOLDERS = 64
+"""Largest depth of folders within a run or sweep folder; Python's own functions fail at a few hundred."""
 REMEDY = (
     "A run folder may come from an untrusted source, so only plain files in it are opened. Replace this entry by a "
     "copy of the file, or remove it."
@@ -38,17 +40,23 @@ def require_enclosed(folder: Path, error: type[UserError] = DataError) -> None:
         return
     if not folder.is_dir():
         raise error(f"{shorten(folder)} is not a folder. Give the folder of a run.")
-    folders, entry_count = [os.fspath(folder)], 0
+    folders, entry_count = [(os.fspath(folder), 0)], 0
     while folders:
+        path, depth = folders.pop()
+        if depth > DEEPEST_FOLDERS:
+            raise error(
+                f"{shorten(folder)} contains folders nested more than {DEEPEST_FOLDERS} levels deep, but no run has "
+                "such folders. Give the folder of a run."
+            )
         try:
-            with os.scandir(folders.pop()) as entries:
+            with os.scandir(path) as entries:
                 for entry in entries:
                     entry_count += 1
                     status = entry.stat(follow_symlinks=False)
                     if fault := _fault(status):
                         raise error(f"{shorten(entry.path)} is {fault}. {REMEDY}")
                     if stat.S_ISDIR(status.st_mode):
-                        folders.append(entry.path)
+                        folders.append((entry.path, depth + 1))
         except FileNotFoundError:  # the process that writes this run has removed the folder in the meantime
             continue
         except OSError as refused:

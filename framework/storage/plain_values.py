@@ -3,6 +3,7 @@
 import json
 import pickletools
 import re
+import sys
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +34,7 @@ _FLOAT = re.compile(
 )
 PlainLoader.add_implicit_resolver("tag:yaml.org,2002:int", _INT, list("-+0123456789"))
 PlainLoader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.0123456789"))
+PlainLoader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: _whole_number(str(node.value)))
 
 
 def read_json(file: Path, expected: str, remedy: str = RESTORE) -> dict[str, Any]:
@@ -43,7 +45,7 @@ def read_json(file: Path, expected: str, remedy: str = RESTORE) -> dict[str, Any
             `expected`, a description of the file, and `remedy`.
     """
     with translate_errors(file, expected, remedy):
-        content = json.loads(decode(_content(file, LARGEST_JSON)))
+        content = json.loads(decode(_content(file, LARGEST_JSON)), parse_int=_whole_number)
         if not isinstance(content, dict):
             raise ValueError(
                 f"the file contains a {type(content).__name__}, but a JSON object ({{...}}) is required"
@@ -78,8 +80,13 @@ def read_yaml(file: Path, expected: str, remedy: str = RESTORE, error: type[User
 
 
 def is_number(value: Any) -> TypeGuard[int | float]:
-    """Return whether a value of JSON or YAML is a number; true and false are not numbers here, unlike in Python."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    """Return whether a value of JSON or YAML is a number that fits into a float.
+
+    Unlike in Python, true and false are not numbers here.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return isinstance(value, float) or abs(value) <= sys.float_info.max
 
 
 def plain_numbers(value: Any) -> Any:
@@ -255,6 +262,17 @@ def _above_mark(stack: list[_Item]) -> list[_Item]:
     items = stack[index + 1 :]
     del stack[index:]
     return items
+
+
+def _whole_number(digits: str) -> int:
+    """Return the integer that a JSON or YAML file contains as `digits`; refuse one that no float represents."""
+    number = int(digits)
+    if abs(number) > sys.float_info.max:
+        raise ValueError(
+            f"the file contains an integer of {len(digits)} digits, but numbers up to {sys.float_info.max:.2g} are "
+            "required"
+        )
+    return number
 
 
 def _content(file: Path, most: int) -> bytes:

@@ -393,7 +393,7 @@ def _record(line: bytes) -> dict[str, Any] | None:
         record = json.loads(line)
     except (ValueError, RecursionError):
         return None
-    if not isinstance(record, dict) or type(record.get("n")) is not int:
+    if not isinstance(record, dict) or type(n := record.get("n")) is not int or not is_number(n):
         return None
     values = record.get("values", {})
     values_valid = isinstance(values, dict) and all(

@@ -8,9 +8,9 @@ import time
 import uuid
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import TypeAdapter
+from pydantic import Field, TypeAdapter
 
 from framework.storage.enclosed import read_plain
 from framework.storage.files import write_whole
@@ -63,14 +63,14 @@ class RunInfo:
     """Folder for the files of a new experiment; None lets the store decide."""
     key: str
     """Id that the framework creates for the run; it finds the run in the store even if `run_id` was never received."""
-    started: float
+    started: Annotated[float, Field(ge=0, le=1e11)]
     """Start of the run, in seconds since 1970."""
     status: str
     """Status of the run: RUNNING, FINISHED, FAILED or KILLED."""
     experiment_id: str | None = None
-    sent: int = 0
+    sent: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Number of the last journal line such that the store has this line and all lines before it."""
-    replay_after: int | None = None
+    replay_after: Annotated[int, Field(ge=0, lt=2**63)] | None = None
     """Step from which the run was last resumed; the run repeats the steps after it."""
     replay_until: dict[str, int] = field(default_factory=dict)
     """Last step of each metric that the store had when the run was resumed; repeated steps up to it are not sent."""
