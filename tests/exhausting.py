@@ -7,6 +7,7 @@ Prints a line of JSON for each: what it was, how it ended, processor seconds and
 import copy
 import io
 import json
+import math
 import os
 import resource
 import signal
@@ -315,6 +316,46 @@ def textured(sides: list[tuple[int, int]]) -> bytes:
     return b"glTF" + struct.pack("<II", 2, 12 + len(parts)) + parts
 
 
+def tiled(side: int) -> bytes:
+    """Return a TIFF file with an image of 16 x 16 pixels in one tile of `side` x `side` pixels, all zero."""
+    packer = zlib.compressobj(9)
+    tile = b"".join(packer.compress(bytes(side)) for _ in range(side)) + packer.flush()
+    tile += bytes(len(tile) % 2)
+    sizes = {256: 16, 257: 16, 258: 8, 259: 8, 262: 1, 277: 1, 322: side, 323: side, 324: 8, 325: len(tile)}
+    entries = b"".join(
+        struct.pack("<HHII", number, 4 if number > 300 else 3, 1, size) for number, size in sizes.items()
+    )
+    return (
+        b"II*\0"
+        + struct.pack("<I", 8 + len(tile))
+        + tile
+        + struct.pack("<H", len(sizes))
+        + entries
+        + bytes(4)
+    )
+
+
+def scanned(scans: int, width: int = 8688, height: int = 5784) -> bytes:
+    """Return a progressive JPEG file in which each scan of some bytes passes over every pixel (end-of-band runs)."""
+
+    def segment(marker: int, content: bytes) -> bytes:
+        return bytes([0xFF, marker]) + struct.pack(">H", len(content) + 2) + content
+
+    def coded(bits: str) -> bytes:
+        bits += "1" * (-len(bits) % 8)
+        return bytes(int(bits[at : at + 8], 2) for at in range(0, len(bits), 8)).replace(b"\xff", b"\xff\0")
+
+    blocks = math.ceil(width / 8) * math.ceil(height / 8)
+    one_code = bytes([1] + [0] * 15)
+    head = segment(0xDB, b"\0" + b"\1" * 64) + segment(
+        0xC2, struct.pack(">BHHB", 8, height, width, 1) + b"\1\x11\0"
+    )
+    head += segment(0xC4, b"\0" + one_code + b"\0") + segment(0xC4, b"\x10" + one_code + b"\xe0")
+    first = segment(0xDA, bytes([1, 1, 0, 0, 0, 0])) + coded("0" * blocks)
+    later = segment(0xDA, bytes([1, 1, 0, 1, 63, 0])) + coded(f"0{2**14 - 1:014b}" * (blocks // 32767 + 1))
+    return b"\xff\xd8" + head + first + later * scans + b"\xff\xd9"
+
+
 def bombs() -> dict[str, tuple[Callable[[], bytes], Callable[[Path], object]]]:
     """Yield files, each with the functions that write and read it."""
     from framework.bodies import body_files, motion
@@ -345,6 +386,8 @@ def bombs() -> dict[str, tuple[Callable[[], bytes], Callable[[Path], object]]]:
         "a progressive JPEG.jpg": (lambda: image("RGB", (side, side), "JPEG", progressive=True), shown),
         "a WebP.webp": (lambda: image("RGBA", (5700, 5700), "WEBP", lossless=True, method=0), shown),
         "a TIFF of fax.tif": (lambda: image("1", (side, side), "TIFF", compression="group4"), shown),
+        "tiles larger than the image.tif": (lambda: tiled(32_768), shown),
+        "many scans.jpg": (lambda: scanned(8000), shown),
         "a GIF.gif": (lambda: image("P", (side, side), "GIF"), shown),
         "points.npz": (
             lambda: archive(points=array((bytes_in_all // 3, 3), "|u1", ones()[: bytes_in_all // 3 * 3])),

@@ -16,6 +16,7 @@ from PIL import Image
 from framework.datasets import images
 from framework.datasets.images import Crop, augment, cut_square, to_rgb8, vary
 from framework.errors import DataError
+from tests.exhausting import scanned, tiled
 
 
 def ramp(width: int, height: int) -> Image.Image:
@@ -276,3 +277,26 @@ def test_real_views_look_most_like_their_neighbours(tmp_path: Path) -> None:
     distance = torch.cdist(crops, crops).fill_diagonal_(math.inf)
     apart = (distance.argmin(1) - torch.arange(72)).abs()
     assert torch.minimum(apart, 72 - apart).max() <= 2
+
+
+def test_small_files_that_take_much_memory_or_time_to_decode_are_refused(tmp_path: Path) -> None:
+    """Tiles that are larger than the image, and scans that pass over every pixel."""
+    for name, content, message in (
+        ("tiles.tif", tiled(7200), r"tiles of 7200 x 7200 pixels; at most 50331648 are allowed"),
+        ("scans.jpg", scanned(200, 64, 48), r"more than 100 scans, which is not allowed"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(DataError, match=rf"{name}: cannot be read as an image \(the image has {message}"):
+            Crop(tmp_path / name, None, 0.0, 8).read()
+
+
+def test_a_photograph_with_a_thumbnail_and_a_film_behind_it_is_read(tmp_path: Path) -> None:
+    """Only the scans of the image count, and not what looks like scans in the data around it."""
+    stream = io.BytesIO()
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8)
+    like_scans = b"\xff\xda" * 200
+    Image.fromarray(noise).save(stream, "JPEG", progressive=True, comment=like_scans, restart_marker_blocks=1)
+    (tmp_path / "one.jpg").write_bytes(stream.getvalue() + like_scans)
+    pixels = Crop(tmp_path / "one.jpg", None, 0.0, 64).read().numpy()
+    with Image.open(stream) as wanted:
+        np.testing.assert_array_equal(pixels, np.asarray(wanted).transpose(2, 0, 1))

@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +24,14 @@ from framework.data import Batch
 from framework.datasets.fields import Fields
 from framework.errors import DataError
 from framework.storage import reading
-from framework.storage.limits import AT_ONCE, LONGEST_SIDE, MOST_PADDED, MOST_PIXELS, MOST_PIXELS_OF
+from framework.storage.limits import (
+    AT_ONCE,
+    LONGEST_SIDE,
+    MOST_PADDED,
+    MOST_PIXELS,
+    MOST_PIXELS_OF,
+    MOST_SCANS,
+)
 from framework.storage.progress import track_progress
 
 READERS = min(8, os.cpu_count() or 1)
@@ -36,6 +44,10 @@ ORIENTATION = 0x0112
 """Number of the EXIF entry with the orientation of an image."""
 BITS_PER_SAMPLE, PHOTOMETRIC = 258, 262
 """Numbers of two TIFF entries: the bits per value, and the meaning of the value 0 (0: white, 1: black)."""
+TILE_SIDES = (322, 323)
+"""Numbers of the TIFF entries with the width and the height of a tile, which may be larger than the image."""
+JPEG_MARKER = re.compile(rb"\xff+([^\x00\x01\xd0-\xd7\xff])")
+"""Pattern of a marker of a JPEG file; 00, 01 and D0 to D7 belong to the compressed pixels (ITU-T T.81, Table B.1)."""
 MODES = {1: "L", 3: "RGB", 4: "RGBA"}
 """Pillow's modes of decoded images, by number of channels."""
 STRIP = 256
@@ -124,7 +136,8 @@ def open_stream(stream: BinaryIO | BytesIO) -> Iterator[Image.Image]:
     If the file holds several images (frames, pages), the first one is opened.
 
     Raises:
-        ValueError: the image has more pixels than `MOST_PIXELS_OF` and `LONGEST_SIDE` allow.
+        ValueError: the image has more pixels than `MOST_PIXELS_OF` and `LONGEST_SIDE` allow, tiles of so many pixels,
+            or more than `MOST_SCANS` scans.
         Exception: the content is not an image, or damaged.
     """
     try:
@@ -138,7 +151,39 @@ def open_stream(stream: BinaryIO | BytesIO) -> Iterator[Image.Image]:
                 f"the image has {image.width} x {image.height} pixels; at most {most} pixels, and {LONGEST_SIDE} "
                 "along a side, are allowed"
             )
+        _require_bounded_decoding(image, stream, most)
         yield image
+
+
+def _require_bounded_decoding(image: Image.Image, stream: BinaryIO | BytesIO, most: int) -> None:
+    """Refuse an image that takes far more memory or time to decode than its number of pixels explains.
+
+    Raises:
+        ValueError: a TIFF image has tiles of more than `most` pixels, or a JPEG image more than `MOST_SCANS` scans.
+    """
+    tags = getattr(image, "tag_v2", {})
+    sides = [tags.get(number, 1) for number in TILE_SIDES]
+    if math.prod(sides) > most:
+        raise ValueError(f"the image has tiles of {sides[0]} x {sides[1]} pixels; at most {most} are allowed")
+    if image.format in ("JPEG", "MPO"):
+        position = stream.tell()
+        stream.seek(0)
+        scans = _count_scans(stream.read())
+        stream.seek(position)
+        if scans > MOST_SCANS:
+            raise ValueError(f"the image has more than {MOST_SCANS} scans, which is not allowed")
+
+
+def _count_scans(content: bytes) -> int:
+    """Return the number of scans of the first image in a JPEG file, at most `MOST_SCANS` + 1."""
+    scans, position = 0, 2
+    while scans <= MOST_SCANS and (marker := JPEG_MARKER.search(content, position)):
+        code, position = marker[1], marker.end()
+        if code == b"\xd9":  # end of the image; phones append a film, or another image
+            break
+        scans += code == b"\xda"
+        position += int.from_bytes(content[position : position + 2], "big")
+    return scans
 
 
 class PixelLimit:

@@ -55,6 +55,11 @@ this memory twice.
 """
 MOST_PIXELS_OF = {"WEBP": 2**25, "JPEG2000": 2**25, "AVIF": 2**25}
 """Largest number of pixels in formats whose decoders create two or three further copies of the image."""
+MOST_SCANS = 100
+"""Largest number of scans of a JPEG image, as in libtiff (LIBTIFF_JPEG_MAX_ALLOWED_SCAN_NUMBER); programs write ten.
+
+A scan of a hundred bytes can pass over every pixel of the image, which takes milliseconds.
+"""
 MOST_PADDED = 2**26
 """Largest number of pixels of an image padded to a square; a larger one is scaled down before the padding."""
 AT_ONCE = 2**25

@@ -63,8 +63,8 @@ def _to_radians(label: Label) -> Label:
 
 
 def _read_struct(content: h5py.File, name: str) -> list[Label]:
-    struct: Any = content[name]
-    fields = {field: _read_cells(content, struct[field]) for field in (*ANGLES, "name")}
+    struct = _member(content, name)
+    fields = {field: _read_cells(content, _member(struct, field)) for field in (*ANGLES, "name")}
     lengths = {field: len(cells) for field, cells in fields.items()}
     if len(set(lengths.values())) != 1:
         raise ValueError(
@@ -75,6 +75,19 @@ def _read_struct(content: h5py.File, name: str) -> list[Label]:
     return [
         Label(text, angles) for text, angles in zip(texts, zip(pan, tilt, roll, strict=True), strict=True)
     ]
+
+
+def _member(group: Any, name: str) -> Any:
+    """Return a member of an HDF5 group, but never follow a link, because opening a pipe elsewhere would never end.
+
+    Raises:
+        ValueError: The name leads to another place of this file or to another file.
+        KeyError: There is no such member.
+    """
+    link = group.get(name, getlink=True)
+    if link is not None and not isinstance(link, h5py.HardLink):
+        raise ValueError(f"{name} is a link to another place or file; expected all values in this file")
+    return group[name]
 
 
 def _read_cells(content: Any, field: h5py.Dataset) -> list[np.ndarray]:

@@ -1,6 +1,7 @@
 """Tests of the IDIAP label file, an HDF5 file: what is read, refused and written."""
 
 import math
+import os
 from pathlib import Path
 
 import h5py
@@ -129,3 +130,20 @@ def test_labels_of_the_generated_set_are_the_random_poses(
         random.integers(PEOPLE)
         poses.append(random_pose(random))
     np.testing.assert_allclose(fields_of(data, "train")["target"].rad2deg(), poses, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["struct elsewhere", "field elsewhere", "struct behind a link"])
+def test_a_link_is_refused_and_never_opened(kind: str, root: Path) -> None:
+    """HDF5 opens the file to which a link leads, and opening a pipe would wait for ever."""
+    os.mkfifo(root / "pipe")
+    with h5py.File(root / LABELS, "r+") as content:
+        elsewhere = h5py.ExternalLink("pipe", "/a")
+        if kind == "field elsewhere":
+            del content["or_label_test"]["pan"]
+            content["or_label_test"]["pan"] = elsewhere
+        else:
+            del content["or_label_train"]
+            content["or_label_train"] = elsewhere if kind == "struct elsewhere" else h5py.SoftLink("/other/a")
+            content["other"] = elsewhere
+    with pytest.raises(DataError, match=r"is a link to another place or file"):
+        read_labels(root / LABELS, "radians")
