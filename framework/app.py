@@ -1,5 +1,6 @@
 """The command line: it composes the config, runs the chosen mode, and reports an error in a sentence."""
 
+import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -10,6 +11,7 @@ from pathlib import Path
 
 from framework.errors import ConfigError, UserError
 from framework.storage.closed_pipes import survive_closed_pipes
+from framework.storage.log_messages import PlainLogRecord
 from framework.storage.threads import wait_passively
 
 START = """\
@@ -62,6 +64,7 @@ def main() -> None:
         if isinstance(stream, TextIOWrapper):  # printing a table must not fail on a terminal without ±
             stream.reconfigure(errors="backslashreplace")
     survive_closed_pipes()
+    logging.setLogRecordFactory(PlainLogRecord)
     # Hydra prints its own errors and exits unless told to raise them.
     full_error = os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"

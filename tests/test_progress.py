@@ -1,11 +1,18 @@
 """Tests of progress reports: none for short work, a bar on a terminal, lines in a log, and none in other ranks."""
 
+import ast
 import io
+import logging
+import re
+from pathlib import Path
 
 import pytest
 from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
-from framework.storage.progress import QUIET_TIME, REPORT_INTERVAL, Work, track_progress
+from framework.storage.log_messages import PlainLogRecord
+from framework.storage.progress import QUIET_TIME, REPORT_INTERVAL, PlainConsole, Work, track_progress
 
 
 class Clock:
@@ -71,3 +78,51 @@ def test_only_the_first_rank_speaks(
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     assert Work("testing", 1, "samples").console.quiet is not first
+
+
+STEERING = "a\x1b]52;c;eA==\x1b\\[/red][bold]\u202e\r\x9b2J\x07b"
+"""A name that writes to the clipboard, reverses the direction of text, returns to the start of the line, and clears."""
+
+
+def table(*, title: str | Text) -> Table:
+    found = Table(STEERING, STEERING, title=title)
+    found.add_row(STEERING, Text(STEERING))
+    return found
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+@pytest.mark.parametrize(
+    "thing",
+    [STEERING, Text(STEERING), table(title=STEERING), table(title=Text(STEERING)), [STEERING]],
+    ids=type,
+)
+@pytest.mark.parametrize("soft_wrap", [False, True])
+def test_a_name_of_another_person_steers_no_terminal(thing: object, terminal: bool, soft_wrap: bool) -> None:
+    out = io.StringIO()
+    console = PlainConsole(file=out, force_terminal=terminal, color_system=None, width=300, highlight=False)
+    console.print(thing, soft_wrap=soft_wrap)
+    said = out.getvalue()
+    if terminal:  # rich's own codes set colours and widths only
+        said = re.sub(r"\x1b\[[\d;]*m", "", said)
+    assert all(letter.isprintable() or letter == "\n" for letter in said), ascii(said)
+    assert "x1b]52;c;eA==" in said and "[/red][bold]" in said
+
+
+def test_the_message_of_a_log_steers_no_terminal() -> None:
+    record = PlainLogRecord("a", logging.WARNING, "a.py", 1, "weights %s", (STEERING,), None)
+    assert record.getMessage().isprintable()
+    assert record.getMessage().startswith("weights a\\x1b]52;c;eA==")
+
+
+def test_no_other_module_makes_a_console() -> None:
+    root = Path(__file__).parent.parent
+    made = {
+        file.relative_to(root).as_posix()
+        for top in ("framework", "plugins", "hydra_plugins")
+        for file in (root / top).rglob("*.py")
+        if not file.name.startswith("test_")
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("Console", "print")
+        if not (isinstance(node.func, ast.Attribute) and node.func.attr == "print")
+    }
+    assert made <= {"framework/storage/progress.py"}, "Use framework.storage.progress.PlainConsole or output."

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from rich.console import Console
 from torch import Tensor
 
 from framework.bodies import body_files
@@ -23,6 +22,7 @@ from framework.errors import DataError
 from framework.storage import cache
 from framework.storage.arrays import read_npz
 from framework.storage.generated import ensure_generated
+from framework.storage.progress import PlainConsole
 from framework.storage.reading import read_bytes, translate_errors
 
 VERSION = 3
@@ -142,7 +142,7 @@ def load_default_body() -> tuple[Body, Traits]:
 def _write(folder: Path) -> None:
     from framework.bodies.extraction import extract  # imports the package, which takes seconds
 
-    Console(stderr=True).print("Extracting the default body, once; this takes about two minutes.")
+    PlainConsole(stderr=True).print("Extracting the default body, once; this takes about two minutes.")
     scratch = folder / "scratch"
     try:
         body, tables = extract(scratch)

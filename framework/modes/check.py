@@ -16,6 +16,7 @@ from framework.configuration.config import Config, Options
 from framework.configuration.settings import Settings
 from framework.errors import ConfigError, UserError
 from framework.reports.table import write_csv
+from framework.storage.progress import PlainConsole
 from framework.testing.contract import CONTRACTS, Contract, Row, contract
 from framework.testing.finding import Finding
 from framework.testing.rows import HeadRow
@@ -56,7 +57,7 @@ def run(config: Config) -> None:
             "mode=check needs a plugin, but none is chosen. Add one, for example `mode=check density_head=<name>`. "
             f"There are contracts for {', '.join(CONTRACTS)}; mode=plugins lists the installed plugins."
         )
-    console, lines, failed = Console(), [], []
+    console, lines, failed = PlainConsole(), [], []
     for group, part in chosen:
         plain = {key: value for key, value in part.items() if key != "name"}
         report, findings, broken = examine(contract(group, part["name"], plain), console)

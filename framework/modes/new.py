@@ -7,11 +7,10 @@ from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
-from rich.console import Console
-
 from framework.configuration.config import Config, Options
 from framework.configuration.registry import GROUPS, installed
 from framework.errors import ConfigError, did_you_mean
+from framework.storage.progress import PlainConsole
 
 SCAFFOLD = Path(__file__).resolve().parent.parent / "scaffold"
 
@@ -42,7 +41,7 @@ def run(config: Config) -> None:
     for path, text in files.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_text(text, encoding="utf-8")
-    console = Console(highlight=False)
+    console = PlainConsole(highlight=False)
     console.print(f"wrote {folder}: {', '.join(files)}", soft_wrap=True, markup=False)
     argument = f"{registry}={name}" if _is_single(registry) else f"'{registry}=[{name}]'"
     console.print("next:", markup=False)

@@ -7,7 +7,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
@@ -15,6 +14,7 @@ from framework.configuration.citations import look_up
 from framework.configuration.config import Config, Options
 from framework.configuration.registry import GROUPS, Entry, installed, origin, package_folders, unusable_names
 from framework.errors import ConfigError, shorten
+from framework.storage.progress import PlainConsole
 
 
 def run(config: Config) -> None:
@@ -25,7 +25,7 @@ def run(config: Config) -> None:
 
 def print_plugins() -> None:
     """Print every registry with the name, description, paper and package of each plugin."""
-    console = Console(highlight=False)
+    console = PlainConsole(highlight=False)
     for group in GROUPS:
         console.print(Text(group, style="bold"))
         for entry in installed(group).values():

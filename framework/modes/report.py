@@ -3,10 +3,9 @@
 from contextlib import suppress
 from pathlib import Path
 
-from rich.console import Console
-
 from framework.configuration.config import Config, Options
 from framework.errors import ConfigError
+from framework.storage.progress import PlainConsole
 from framework.sweeps.pages import write_report
 
 
@@ -32,4 +31,4 @@ def run(config: Config) -> None:
     files = write_report(folder, Path(options.into).expanduser() if options.into else folder)
     with suppress(OSError):  # an empty run folder of this command
         config.folder.rmdir()
-    Console(highlight=False).print(f"report: {', '.join(map(str, files))}", soft_wrap=True, markup=False)
+    PlainConsole(highlight=False).print(f"report: {', '.join(map(str, files))}", soft_wrap=True, markup=False)

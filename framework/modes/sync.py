@@ -2,11 +2,10 @@
 
 from pathlib import Path
 
-from rich.console import Console
-
 from framework.configuration.config import Config, Options
 from framework.errors import ConfigError, UserError
 from framework.runs.job import find_job_folders
+from framework.storage.progress import PlainConsole
 from framework.tracking.ended import sync
 
 
@@ -38,7 +37,7 @@ def run(config: Config) -> None:
         except UserError as error:
             errors.append(error)
         else:
-            Console().print(f"{lines} journal lines sent from {run}.")
+            PlainConsole().print(f"{lines} journal lines sent from {run}.")
     if len(errors) == 1:
         raise errors[0]
     if errors:

@@ -24,6 +24,7 @@ from framework.runs.session import Session, trained_batches
 from framework.storage.checkpoints import read
 from framework.storage.first_rank import first_rank
 from framework.storage.processor import fast_bfloat16
+from framework.storage.progress import PlainConsole
 from framework.tracking.signals import Stopped
 from framework.training.cached_features import CachedFeatures, fits
 from framework.training.callbacks import build_callbacks
@@ -300,7 +301,7 @@ def _trainer(run: Run, keep: KeepCheckpoints, console: Console) -> pl.Trainer:
     if (run.folder / RECORD).is_file():  # the run is a job of a sweep, which may be a search that prunes
         callbacks.append(StopIfPruned(run.folder / PRUNED))
     if chosen.get("enable_progress_bar", True):
-        terminal = Console(stderr=True, quiet=console.quiet)
+        terminal = PlainConsole(stderr=True, quiet=console.quiet)
         callbacks.append(Progress(terminal if terminal.is_terminal else console))
     arguments = _with_precision({key: value for key, value in chosen.items() if key not in TRAINER_OURS})
     if chosen.get("precision") == "auto":

@@ -1,13 +1,15 @@
-"""Progress reports of long work: a bar on a terminal, or a line every half minute in a log file."""
+"""Printing of results as plain text, and progress reports of long work: a bar on a terminal, or lines in a log file."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
-from typing import TypeVar, final
+from typing import Any, TypeVar, final
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.segment import Segment
 
+from framework.errors import escape_unprintable
 from framework.storage.first_rank import first_rank
 
 Item = TypeVar("Item")
@@ -17,10 +19,30 @@ WIDE = 160
 """Number of characters in a line of a log file."""
 
 
+class PlainConsole(Console):
+    """Console that prints every text as it is: brackets are not markup, and control characters are escaped.
+
+    Names of methods, classes, columns and files may come from another person's checkpoint, table or folder. A control
+    sequence in them could write to the clipboard of a terminal or hide text.
+
+    Args:
+        options: Arguments of `rich.console.Console`.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(markup=False, **options)
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+        """Yield the segments of `Console.render`, with control characters in texts escaped."""
+        for segment in super().render(renderable, options):
+            # rich moves the cursor by segments with control codes, which contain no text of others
+            yield segment if segment.control else Segment(escape_unprintable(segment.text), segment.style)
+
+
 def output() -> Console:
     """Return the console for results, which prints on the first rank only and wraps lines in a log file at `WIDE`."""
-    console = Console(quiet=not first_rank())
-    return console if console.is_terminal else Console(quiet=console.quiet, width=WIDE)
+    console = PlainConsole(quiet=not first_rank())
+    return console if console.is_terminal else PlainConsole(quiet=console.quiet, width=WIDE)
 
 
 @final
@@ -45,7 +67,7 @@ class Work:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.name, self.total, self.units = name, total, units
-        self.console = console or Console(stderr=True, quiet=not first_rank())
+        self.console = console or PlainConsole(stderr=True, quiet=not first_rank())
         self.clock = clock
         self.completed = 0
         self._start = clock()

@@ -9,9 +9,9 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
-from rich.console import Console
 
 from framework.storage.files import write_whole
+from framework.storage.progress import PlainConsole
 
 OF_THE_RUN = ("logger", "mode", "debug", "threads", "workers", "resume")
 """Keys that do not change the results of a trial; they are not part of the experiment and stay on the command line."""
@@ -35,7 +35,7 @@ def write_best(folder: Path, overrides: Sequence[str], loader: ConfigLoader, ori
         old.unlink()
     write_whole(folder / "experiment" / f"{name}.yaml", content.encode())
     command = content.splitlines()[1].removeprefix("# python -m framework ")
-    Console().print(
+    PlainConsole().print(
         f"best trial: {path}\n"
         f"run it:     python -m framework --config-dir={shlex.quote(str(folder))} {command}\n"
         f"keep it:    copy it to conf/experiment/{name}.yaml",
