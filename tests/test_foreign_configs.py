@@ -38,6 +38,19 @@ BAD = {
     "mode": ("x.yaml", "mode: {name: encode, files: /home, into: /tmp}"),
     "config of a sweep": ("experiment/x.yaml", "defaults: [/multirun@_global_]"),
     "config of a job": ("experiment/x.yaml", "defaults: [{/0@_global_: config}]"),
+    "sweep over stores": ("x.yaml", "hydra: {sweeper: {params: {logger.uri: 'http://127.0.0.2'}}}"),
+    "sweep over folders": ("x.yaml", "hydra: {sweeper: {params: {hydra.run.dir: '/a,/b'}}}"),
+    "sweep over modes": ("x.yaml", "hydra: {sweeper: {params: {+mode: encode}}}"),
+    "sweep over a package": ("x.yaml", "hydra: {sweeper: {params: {a@hydra.job.env_set: b}}}"),
+    "sweep over flags": ("x.yaml", "hydra: {sweeper: {params: {--config-dir: b}}}"),
+    "sweep of text": ("x.yaml", "hydra: {sweeper: {params: logger.uri=a}}"),
+    "run to continue": ("x.yaml", "resume: /home/me/run"),
+    "sweep over runs to continue": ("x.yaml", "hydra: {sweeper: {params: {resume: /home/me/run}}}"),
+    "environment variable": ("x.yaml", "experiment_name: ${oc.env:AWS_SECRET_ACCESS_KEY}"),
+    "environment variable in a list": ("x.yaml", "a: [{b: 'c ${oc.env:HOME}'}]"),
+    "environment variable by a nested name": ("x.yaml", "b: oc\na: ${${b}.env:HOME}"),
+    "environment variable in a choice": ("x.yaml", "defaults: [{/a: '${oc.env:HOME}'}]"),
+    "path of this machine": ("x.yaml", "a: ${hydra:runtime.cwd}"),
     "alias": ("x.yaml", "a: &a [1]\nb: *a"),
 }
 GROUPS = ("experiment", "data", "logger", "a")
@@ -78,9 +91,10 @@ def test_what_it_may_say_passes(tmp_path: Path) -> None:
             {"override /logger": "none"},
             "_self_",
         ],
-        "hydra": {"sweeper": {"params": {"seed": "1,2"}}, "launcher": {"jobs": 2}},
+        "hydra": {"sweeper": {"params": {"seed": "1,2", "+data.mode": "a,b"}}, "launcher": {"jobs": 2}},
         "logger": {"experiment": "mine"},
-        "data": {"root": "/data"},
+        "resume": "never",
+        "data": {"root": "/data", "size": "${seed}", "name": "${.size} of ${a.${b}[0]}"},
     }
     (tmp_path / "experiment" / "x.yaml").write_text("# @package _global_\n" + yaml.safe_dump(content))
     require_harmless([f"--config-dir={tmp_path}"], GROUPS)

@@ -1,13 +1,14 @@
 """Checks of config folders that a command adds (`--config-dir`), so that an untrusted folder cannot run code."""
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 import yaml
 from hydra._internal.utils import get_args_parser
 
 from framework.configuration.schema import forbid_targets
+from framework.configuration.stored_keys import names_run
 from framework.errors import ConfigError, quote, shorten
 from framework.storage.enclosed import require_enclosed
 from framework.storage.plain_values import read_yaml
@@ -26,6 +27,14 @@ PART_KEYS = {
     ),
 }
 """Keys of the launcher and the sweeper that an added config folder may set; others reach other machines."""
+KEY = re.compile(r"[+~]{0,2}(\w+)(?:[./]\w+)*(?:@(\w+)(?:\.\w+)*)?")
+"""Pattern of a key that a sweep varies; the groups are the first words of the key and of its package."""
+REFERENCE = re.compile(r"\$\{[\w.\[\]]+\}")
+"""Pattern of an interpolation that stands for another value of the config.
+
+Every other interpolation calls a function, which can copy an environment variable or a path of this machine into the
+files of the run.
+"""
 CHOSEN = re.compile(r"hydra/(launcher|sweeper)|logger")
 MOST = 1000
 """Largest number of config files in an added config folder."""
@@ -41,7 +50,7 @@ def require_harmless(arguments: Sequence[str], groups: Collection[str]) -> None:
 
     Raises:
         ConfigError: A folder contains links, or it configures Hydra's logging, callbacks, environment or folders, the
-            address of a store, or a mode.
+            address of a store, a mode, a run to continue, or an interpolation that reads more than the config.
     """
     named, _ = get_args_parser().parse_known_args(list(arguments))
     for text in (named.config_dir, named.config_path):
@@ -89,6 +98,13 @@ def _require_harmless(file: Path, folder: Path, groups: Collection[str]) -> None
             chosen = value.get(part) if isinstance(value, dict) else None
             if chosen is not None and not (isinstance(chosen, dict) and set(chosen) <= set(part_keys)):
                 raise _refusal(file, f"sets {key}.{part}: {quote(chosen)}")
+            if part == "sweeper" and isinstance(chosen, dict):
+                _require_harmless_sweep(file, chosen.get("params"))
+    if names_run(content.get("resume")):
+        raise _refusal(file, f"sets resume: {quote(content['resume'])}")
+    for text in _texts(content):
+        if "${" in _without_references(text):
+            raise _refusal(file, f"contains {quote(text)}, which may read more than the config")
     try:
         forbid_targets(content)
     except ConfigError as error:
@@ -105,6 +121,36 @@ def _require_harmless(file: Path, folder: Path, groups: Collection[str]) -> None
             # other files in the folder, which a sweep may have left, were not checked; Hydra reports missing ones
             if absolute and first not in (*groups, "", "_self_") and _has_config(folder, first):
                 raise _refusal(file, f"chooses {quote(entry)}")
+
+
+def _require_harmless_sweep(file: Path, params: object) -> None:
+    """Refuse a sweep that varies a part of the config that only the user may set (`OWN`)."""
+    if params is None:
+        return
+    if not isinstance(params, dict):
+        raise _refusal(file, f"sets hydra.sweeper.params: {quote(params)}")
+    for key in params:
+        match = KEY.fullmatch(str(key))
+        if match is None or {*match.groups()} & {*OWN, "resume"}:
+            raise _refusal(file, f"sweeps over {quote(key)}")
+
+
+def _texts(value: object) -> Iterator[str]:
+    """Yield all texts in nested dictionaries and lists, keys included."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from (*_texts(key), *_texts(item))
+    elif isinstance(value, list):
+        for item in value:
+            yield from _texts(item)
+    elif isinstance(value, str):
+        yield value
+
+
+def _without_references(text: str) -> str:
+    """Return a text without interpolations that stand for values of the config, including nested ones."""
+    shorter = REFERENCE.sub("x", text)
+    return text if shorter == text else _without_references(shorter)
 
 
 def _is_own(group: str, package: str) -> bool:
