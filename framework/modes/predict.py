@@ -34,6 +34,7 @@ from framework.runs.run import open_run
 from framework.runs.session import Session, for_trained, note_idle_samples
 from framework.runs.user_files import UNREADABLE, list_files, print_left_out, select_files
 from framework.storage.names import spell_name
+from framework.storage.text import defuse_formulas
 from framework.target import Target
 from framework.training.batches import Batches, track_batches
 
@@ -86,8 +87,9 @@ def run(config: Config) -> None:
         path = run.folder / "predictions.csv"
         with path.open("w", newline="", encoding="utf-8") as stream:
             writer = csv.writer(stream)
-            writer.writerow(table)
-            writer.writerows(zip(*table.values(), strict=True))
+            writer.writerow(map(defuse_formulas, table))
+            for row in zip(*table.values(), strict=True):
+                writer.writerow(map(defuse_formulas, row))
         run.tracker.log_artifact(path)
         session.console.print(f"{len(table['sample'])} predictions in {path}", soft_wrap=True)
         if options.interval and any(key.endswith(ERRORS) for key in table):

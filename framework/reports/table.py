@@ -17,6 +17,7 @@ from rich.text import Text
 
 from framework.errors import ConfigError, escape_undecodable
 from framework.evaluation.significance import RULE, mean, significantly_best
+from framework.storage.text import defuse_formulas
 
 Row = Mapping[str, object]
 """Names and numbers of one result.
@@ -186,7 +187,7 @@ def write_csv(rows: Sequence[Row], columns: Iterable[str] | None, path: Path) ->
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", encoding="utf-8") as file:
         table = writer(file, lineterminator="\n")
-        table.writerow(map(escape_undecodable, keys))
+        table.writerow(defuse_formulas(escape_undecodable(key)) for key in keys)
         table.writerows([_raw(row.get(key)) for key in keys] for row in rows)
 
 
@@ -340,7 +341,7 @@ def _raw(value: object) -> object:
     if isinstance(value, bool | np.bool_):
         return "true" if value else "false"
     if isinstance(value, str):
-        return escape_undecodable(value).replace("\r", r"\x0d")
+        return defuse_formulas(escape_undecodable(value).replace("\r", r"\x0d"))
     if isinstance(value, Integral) or not isinstance(value, SupportsFloat):
         return "" if value is None else value
     return "" if math.isnan(float(value)) else repr(float(value))
@@ -385,7 +386,9 @@ def _wrap(heading: str, width: int) -> str:
 
 
 def _escape(cell: Text) -> str:
-    text = cell.plain.replace("|", "\\|").replace("\n", " ")
+    text = " ".join(cell.plain.splitlines())
+    # a name of another person must not become an image that a reader's browser loads, nor end the cell
+    text = re.sub(r"([\\|\[\]`*])", r"\\\1", text).replace("<", "&lt;")
     return f"**{text}**" if cell.spans else text
 
 
@@ -421,6 +424,8 @@ _LATEX = {
 
 def _latex_cell(cell: Text) -> str:
     text = "".join(_LATEX.get(letter, letter) for letter in cell.plain)
+    if text.startswith(("[", "*")):  # the end of the line before, \\, would take these signs as its arguments
+        text = f"{{}}{text}"
     return rf"\textbf{{{text}}}" if cell.spans else text
 
 

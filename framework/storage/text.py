@@ -40,6 +40,20 @@ INVISIBLE = "\ufeff\u200b\u200c\u200d\u200e\u200f\u2060"
 """Zero-width characters, which text copied from web pages and office programs contains."""
 
 
+FORMULA = re.compile(r"(^|[;,\t\r\n])(\s*)([=+\-@])(?=[^;,\t\r\n]*[(|!])")
+"""Pattern of a formula that calls a function or a program, at the start of a cell for any separator of cells."""
+
+
+def defuse_formulas(cell: str) -> str:
+    """Return the text of a CSV cell in which a spreadsheet finds no formula that calls a function or a program.
+
+    The names of classes, methods and files may come from another person, and a formula can start a program or send the
+    table to a server. An apostrophe before the sign makes the formula plain text. Other names that begin with such a
+    sign, such as -ve, are unchanged.
+    """
+    return FORMULA.sub(r"\1\2'\3", cell)
+
+
 def remove_byte_order_mark(content: bytes) -> bytes:
     """Return the bytes of a text, or of a file that begins with text, without the byte-order mark of UTF-8.
 

@@ -18,6 +18,7 @@ from typing import Any, Literal, final
 
 from framework.errors import ConfigError
 from framework.storage.files import write_whole
+from framework.storage.text import defuse_formulas
 from framework.tracking.journal import Journal
 from framework.tracking.tracker import Status, Tracker
 
@@ -98,7 +99,7 @@ class CsvCopy(Copy):
         names = dict.fromkeys(name for line in lines for name in line.values)
         text = io.StringIO()
         writer = csv.DictWriter(text, ["step", "epoch", "time", *names])
-        writer.writeheader()
+        writer.writerow({name: defuse_formulas(name) for name in writer.fieldnames})
         for line in lines:
             writer.writerow({"step": line.step, "epoch": line.epoch, "time": line.time, **line.values})
         write_whole(self.folder / "metrics.csv", text.getvalue().encode())
