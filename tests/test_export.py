@@ -458,6 +458,20 @@ def test_the_exported_folder_needs_numpy_and_onnxruntime_alone(framework: Framew
     assert again.code != 0 and "is not empty" in again.out
 
 
+@pytest.mark.parametrize("name", ["this", "os.path", "../densities", "/densities"])
+def test_a_description_of_another_person_imports_no_module(
+    name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("onnxruntime")
+    from framework.deployment.exported_folder.predict import load
+
+    (tmp_path / "density.json").write_text(json.dumps({"modules": [name]}))
+    (tmp_path / "densities.py").write_text("print('run')")
+    with pytest.raises(ValueError, match=r"names the module '.*', which is not beside .*predict\.py"):
+        load(tmp_path)
+    assert capfd.readouterr().out == ""
+
+
 MALFORMED = (
     b"", b"{", b"\xff\xfe", b"null", b"[]", b"[" * 5000 + b"]" * 5000, b'{"inputs": "x"}', b'{"inputs": null}',
     b'{"inputs": {"a": 1}}', b'{"inputs": []}', b'{"inputs": [[1, 2]]}', b'{"inputs": [[1, 2, 3], [1]]}',

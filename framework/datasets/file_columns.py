@@ -8,6 +8,7 @@ from typing import Literal, cast
 
 from framework.datasets.csv_columns import Columns, Writing, read_columns
 from framework.errors import DataError, did_you_mean, quote, shorten
+from framework.storage.names import is_within
 
 Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
@@ -39,7 +40,8 @@ def list_files(table: Columns) -> Iterator[tuple[str, Split | None]]:
     """Yield the file and the split of each row; the split is None if the table has no column of splits.
 
     Raises:
-        DataError: A name of a file is missing or occurs twice, or a split is unknown; the message names the line.
+        DataError: A name of a file is missing, leads out of the folder or occurs twice, or a split is unknown; the
+            message names the line.
     """
     first_line: dict[str, int] = {}
     for index, (number, path) in enumerate(zip(table.lines, table.cells[FILE], strict=True)):
@@ -48,6 +50,11 @@ def list_files(table: Columns) -> Iterator[tuple[str, Split | None]]:
         if not name:
             raise DataError(
                 f"{table.file} line {number}: The column `{FILE}` is empty. Write the name of an image there."
+            )
+        if not is_within(name):
+            raise DataError(
+                f"{table.file} line {number}: {quote(path)} lies outside of the folder of the data. Write a path below "
+                "data.root, or set data.root to a folder that contains all images."
             )
         if name in first_line:
             raise DataError(

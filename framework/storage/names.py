@@ -34,6 +34,14 @@ def path_of(spelling: str) -> Path:
     return Path(os.fsdecode(name))
 
 
+def is_within(name: str) -> bool:
+    """Return whether a path that a list or table names stays in the folder of the data, to which it is joined.
+
+    A list from another person could otherwise name private images, which the figures of a run would show.
+    """
+    return not name.startswith("/") and ".." not in name.split("/")
+
+
 def as_bytes(name: str | os.PathLike[str]) -> bytes:
     """Return a file's name as bytes for hashing: UTF-8, and different for different names."""
     return os.fspath(name).encode("utf-8", "surrogatepass")

@@ -46,6 +46,14 @@ class Model:
     def __init__(self, folder: str | Path, threads: int = 1) -> None:
         folder = Path(folder)
         self.description: dict[str, Any] = json.loads((folder / "density.json").read_text(encoding="utf-8"))
+        modules = self.description["modules"]
+        # density.json may come from another person, and importing a module runs its code
+        beside = {path.stem for path in Path(__file__).parent.glob("*.py")}
+        if foreign := [name for name in modules if name not in beside]:
+            raise ValueError(
+                f"{folder} names the module {foreign[0]!r}, which is not beside {__file__}. Use the predict.py of the "
+                "folder itself, if you trust its files."
+            )
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
@@ -53,7 +61,7 @@ class Model:
             str(folder / "model.onnx"), options, providers=["CPUExecutionProvider"]
         )
         self._families: dict[str, Any] = {}
-        for name in self.description["modules"]:
+        for name in modules:
             self._families.update(importlib.import_module(name).FAMILIES)
         self._outputs: list[str] = self.description["outputs"]
         self._shape: list[int | str] = self.description["input"]["shape"]

@@ -14,6 +14,7 @@ import scipy.io
 
 from framework.datasets.matlab import read_variables
 from framework.errors import DataError, shorten
+from framework.storage.names import is_within
 from plugins.data.head_pose.archive import TRAIN_AND_TEST
 
 LABELS = "or_label.mat"
@@ -54,13 +55,13 @@ def read_labels(file: Path) -> dict[str, list[Label]]:
 def _label(file: Path, position: str, entry: Any) -> Label:
     """Return the label in one element of a struct array; `position` names the element in messages."""
     values = list(entry.values()) if isinstance(entry, dict) else [entry]
-    if len(values) == len(FIELDS) and isinstance(values[-1], str) and values[-1]:
+    if len(values) == len(FIELDS) and isinstance(values[-1], str) and values[-1] and is_within(values[-1]):
         gaze = np.asarray(values[0])
         if gaze.size == 1 and gaze.dtype.kind in "iuf":
             return Label(values[-1], float(gaze.item()))
     raise DataError(
         f"{file}: {position} holds {shorten(values)}; expected a struct of {', '.join(FIELDS)}, where gaze is a "
-        "number of degrees. Copy the file again from its source."
+        "number of degrees and name that of an image in the folder. Copy the file again from its source."
     )
 
 

@@ -12,7 +12,8 @@ from typing import Any, Literal, NamedTuple
 import h5py
 import numpy as np
 
-from framework.errors import DataError
+from framework.errors import DataError, quote
+from framework.storage.names import is_within
 from framework.storage.reading import open_regular, translate_errors
 from plugins.data.head_pose.archive import TRAIN_AND_TEST
 
@@ -71,6 +72,9 @@ def _read_struct(content: h5py.File, name: str) -> list[Label]:
             f"the fields of the struct {name} have different lengths: {lengths}; expected one length"
         )
     texts = [cell.astype("<u2").tobytes().decode("utf-16-le") for cell in fields["name"]]
+    outside = [text for text in texts if not is_within(text)]
+    if outside:
+        raise ValueError(f"the image {quote(outside[0])} of {name} lies outside of the folder of the data")
     pan, tilt, roll = ([float(cell.item()) for cell in fields[angle]] for angle in ANGLES)
     return [
         Label(text, angles) for text, angles in zip(texts, zip(pan, tilt, roll, strict=True), strict=True)

@@ -40,13 +40,15 @@ def test_fields_are_read_by_their_order(root: Path) -> None:
     "bad",
     [
         [[], 1, 1, 1, "a"],
+        [1, 1, 1, 1, "../a"],
+        [1, 1, 1, 1, "/a"],
         ["left", 1, 1, 1, "a"],
         [[1.0, 2.0], 1, 1, 1, "a"],
         [1j, 1, 1, 1, "a"],
         [1.0, 1, 1, 1, ""],
         [1.0, 1, 1, 1, 7],
     ],
-    ids=["empty", "text", "two", "complex", "no name", "number for a name"],
+    ids=["empty", "above", "absolute", "text", "two", "complex", "no name", "number for a name"],
 )
 def test_element_that_is_no_label_is_named(root: Path, bad: list[Any]) -> None:
     save_caviar(root, struct_array([caviar_row(0), bad]), struct_array([caviar_row(20)]))

@@ -147,3 +147,11 @@ def test_a_link_is_refused_and_never_opened(kind: str, root: Path) -> None:
             content["other"] = elsewhere
     with pytest.raises(DataError, match=r"is a link to another place or file"):
         read_labels(root / LABELS, "radians")
+
+
+@pytest.mark.parametrize("name", ["../a.png", "/home/a.png", "a/../../b.png"])
+def test_an_image_outside_of_the_folder_is_refused(name: str, tmp_path: Path) -> None:
+    label = Label(name, (0.0, 0.0, 0.0))
+    write_labels(tmp_path / LABELS, {"train": [label], "test": [Label("b.png", (0.0, 0.0, 0.0))]})
+    with pytest.raises(DataError, match=r"lies outside of the folder of the data"):
+        read_labels(tmp_path / LABELS, "radians")

@@ -105,6 +105,12 @@ def table_with(line: str, header: str = "file,pan,tilt", index: int = 3) -> str:
         (table_with("777.png,3,4,5"), r"line 5: the line has 4 cells, but the first line names 3"),
         (table_with("  ,3,4"), r"line 5: The column `file` is empty\. Write the name of an image"),
         (table_with("001.png,3,4"), r"line 5: '001\.png' is already listed in line 3"),
+        (table_with("../001.png,3,4"), r"line 5: '\.\./001\.png' lies outside of the folder of the data"),
+        (table_with("a/../../001.png,3,4"), r"line 5: .* lies outside of the folder of the data"),
+        (
+            table_with("/home/001.png,3,4"),
+            r"line 5: '/home/001\.png' lies outside .* set data\.root to a folder",
+        ),
         (table_with("./001.png,3,4"), r"line 5: '\./001\.png' is already listed in line 3"),
         (table_with("a/..//001.png,3,4"), r"line 5: 'a/\.\.//001\.png' is already listed in line 3"),
         ('file,pan\n"000.png,3', r"cannot be read .* Save it as UTF-8 text"),

@@ -16,6 +16,7 @@ import numpy as np
 from framework.datasets.images import Box
 from framework.datasets.matlab import read_variables
 from framework.errors import DataError, quote
+from framework.storage.names import is_within
 from framework.storage.reading import read_bytes, translate_errors
 from framework.storage.text import lines_of
 
@@ -107,7 +108,7 @@ def read_list(file: Path) -> list[str]:
         match line.split():
             case []:
                 continue
-            case [name] | [name, "1" | "0"]:
+            case [name] | [name, "1" | "0"] if is_within(name):
                 names.append(name)
             case [_, "-1"]:
                 continue

@@ -237,6 +237,10 @@ def test_a_list_gives_its_positive_images_and_names_a_line_that_is_wrong(tmp_pat
     file.write_text("2008_000001 1\n2008_000002 7\n", encoding="utf-8")
     with pytest.raises(DataError, match=r"car_train\.txt line 2: '2008_000002 7' is neither"):
         layout.read_list(file)
+    for outside in ("../2008_000001", "/home/2008_000001 1"):
+        file.write_text(outside, encoding="utf-8")
+        with pytest.raises(DataError, match=rf"car_train\.txt line 1: '{outside}' is neither an image name"):
+            layout.read_list(file)
     for (
         end
     ) in "\x0b\x0c\x1c\x1d\x1e\x85\u2028\u2029":  # Python ends lines at these characters, but files do not
