@@ -153,7 +153,12 @@ def conclusion(rows: Sequence[Mapping[str, Any]]) -> str:
         "Of the methods whose accuracy is the highest, or is equal to the highest within the standard error, "
         f"**{fastest['method']}** is the fastest."
     )
-    return f"{text} The other methods with such an accuracy are: {', '.join(others)}." if others else text
+    if not others:
+        return text
+    return (
+        f"{text} The other methods with such an accuracy are (operations and run time relative to the fastest): "
+        f"{', '.join(others)}."
+    )
 
 
 def main() -> None:
@@ -171,12 +176,12 @@ def main() -> None:
         f"{count} objects of five classes, with 101 to 28,100 points each. It is divided into 5 folds, and each fold "
         "is the test split of one run, so that each object is tested once. The text at the top of `dales.py` lists "
         f"the commands that train the models. Each model is trained for {epochs}.\n\n"
-        "*basis points* describes a cloud by the distances from 512 basis points to its nearest points (`bps`). "
-        "*Point-NN* describes it by sines and cosines of 512 points, pooled over 40 neighbours (`point_nn`). "
-        "Both have no trained parameters; two layers of 400 units follow them. *Deep Sets*, *PointNet* and "
-        "*DGCNN* are trained networks on the points (`deepsets`, `pointnet` without the matrices that transform points "
-        "and features, `dgcnn`). DGCNN has three edge convolutions of 32, 32 and 64 outputs over 10 neighbours. The "
-        "published DGCNN reads 1024 points and is wider.\n\n"
+        "*basis points* describes a cloud by the distance from each of 512 basis points to the nearest point of the "
+        "cloud (`bps`). *Point-NN* describes a cloud by sines and cosines of 512 points, pooled over 40 "
+        "neighbours (`point_nn`). Both have no trained parameters; two layers of 400 units follow them. "
+        "*Deep Sets*, *PointNet* and *DGCNN* are trained networks on the points (`deepsets`, `pointnet` without the "
+        "matrices that transform points and features, `dgcnn`). DGCNN has three edge convolutions of 32, 32 and 64 "
+        "outputs over 10 neighbours. The published DGCNN reads 1024 points and is wider.\n\n"
         "Accuracy is the share of objects that are classified correctly. NLL is the mean negative log-likelihood of "
         "the true class; lower is better. ECE is the expected calibration error; 0 is best. The spread is the standard "
         "deviation of the accuracy over the folds. MFLOP counts the operations of matrix products only. For "

@@ -33,19 +33,18 @@ SCORES: dict[str, dict[str, Any] | None] = {
 }
 """Scores by name: settings of `feature_score`, or None for scores of the density."""
 REMARKS = {
-    "moons": "`relative Mahalanobis` is the difference of two distances, whose covariances differ only along "
-    "the line that "
-    "separates the class means. For two classes it therefore reads one direction of the features only. With seed "
+    "moons": "`relative Mahalanobis` is the difference of two distances, whose covariances differ only along the line "
+    "that separates the class means. For two classes it therefore reads one direction of the features only. With seed "
     "2, the outliers lie in this direction between -2.7 and 2.1 within-class standard deviations (5th and 95th "
-    "percentile), and the test samples between -2.3 and 2.3, so that the score cannot tell them apart, although "
-    "their squared distance from the class means is 90 times as large (no command repeats these two evaluations). "
+    "percentile), and the test samples between -2.3 and 2.3, so that the score cannot tell them apart. This "
+    "happens although the squared distance of the outliers from the class means is 90 times that of the test samples "
+    "(no command repeats these two evaluations). "
     "Do not use this score for few classes and outliers that are far away. In an earlier version each of the two "
     "covariances had its own shrinkage. With seed 0, the smallest variances of the two were then 0.0023 and "
-    "0.0021, and outliers, which lie in directions of small variance, got a score of -355 instead of 3.8 "
-    "(medians): the AUROC was 2e-7.",
-    "digits": "The rows of `relative Mahalanobis` on digits were measured with the earlier version, in which "
-    "each of the "
-    "two covariances had its own shrinkage.",
+    "0.0021. The outliers lie in directions of small variance. Their median score was therefore -355 instead of "
+    "3.8, and the AUROC was 2e-7.",
+    "digits": "The rows of `relative Mahalanobis` on digits were measured with the earlier version, in which each of "
+    "the two covariances had its own shrinkage.",
 }
 """Explanations under the tables."""
 MOONS_EPOCHS, DIGITS_EPOCHS = 100, 3

@@ -195,8 +195,8 @@ def section(name: str, runs: Mapping[str, list[Trial]]) -> list[str]:
         *lines,
         "",
         "A grid dominates the front of a search if the points of the grid beat every point of this front. This "
-        f"happened in {dominated} of {len(searches) * len(grids)} comparisons. The following counts are means over "
-        "the searches of how many points on the front of a grid the search beats: "
+        f"happened in {dominated} of {len(searches) * len(grids)} comparisons. In the other direction, a search "
+        "can beat points on the front of a grid. The mean number of beaten points, over the searches, is: "
         + ", ".join(f"{count} for the {grid}" for count, grid in zip(against, grids, strict=True))
         + ".",
         "",

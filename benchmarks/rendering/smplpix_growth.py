@@ -112,10 +112,10 @@ def report(figure_path: Path) -> str:
             "",
             "In the table, `rasterised` is the rendering of the mesh. `projection alone` only projects the "
             "vertices into the image. `SMPLpix` is projection followed by the network `slim`. `slim over the "
-            "mesh` is the network on a rendered mesh with depth. `last / first` is the time with the most "
-            "vertices divided by the time with the fewest. `slope` is the slope of the time between the last two "
-            "columns of vertices, on double logarithmic axes: 1 means that the time is proportional to the number "
-            "of vertices.",
+            "mesh` is the network applied to a rendered image of the mesh with depth. `last / "
+            "first` is the time with the most vertices divided by the time with the fewest. `slope` is the "
+            "slope of the time between the last two columns of vertices, on double logarithmic axes: 1 means that "
+            "the time is proportional to the number of vertices.",
             "",
             f"| way to draw | {' | '.join(f'{count:,} vertices, ms' for count in counts)} | last / first | slope |",
             f"|---|{'---|' * (len(counts) + 2)}",

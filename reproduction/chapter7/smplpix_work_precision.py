@@ -160,8 +160,9 @@ def main(runs: list[str]) -> None:
         f"{about} The terms in the table mean:",
         "- **Samples** is the number of samples per pixel along each axis with which a mesh is drawn.",
         "- **Inside** means that only the pixels of the subject count; the other columns are over the whole frame.",
-        "- **Distance in random features** compares the features of an untrained network (objective "
-        "`random_features`); lower is better. It replaces LPIPS, whose weights are not available.",
+        "- **Distance in random features** is the distance between the features of the drawn image and of the "
+        "photograph in an untrained network (objective `random_features`); lower is better. It replaces LPIPS, whose "
+        "weights are not available.",
         "- **Drawing** is the processor time in milliseconds to draw the mesh or to project its vertices, **network** "
         "that of the network, for one image on one thread.",
         "- `box` networks compute only the bounding box of the subject, `frame` networks the whole image.",

@@ -160,9 +160,9 @@ has.
 - *silently other numbers*: the reader returns without an error, but arrays that were not damaged have changed, or a
   damaged type, shape or structure was accepted.
 
-In the rows "arrays of …", one array in the checkpoint of a model with that plugin is damaged. The model is then
-loaded and predicts. All plugins that store arrays are included, except `inception_resnet_v2` (218 MB) and `resnet` (45
-MB), whose weights are read by the same code as other networks.
+In the rows "arrays of …", one array in the checkpoint of a model with the named plugin is damaged. The model is then
+loaded, and makes a prediction. All plugins that store arrays are included, except `inception_resnet_v2` (218 MB) and
+`resnet` (45 MB), whose weights are read by the same code as those of other networks.
 
 {table}
 
