@@ -104,27 +104,28 @@ def page() -> None:
         "# Distillation of an ensemble into one network",
         "",
         "This page compares one network, an ensemble, and students: single networks of the same size that were trained "
-        "with `objective=[distillation]`, whose teacher is the ensemble. The teacher has nine tenths of the student's "
-        "loss, the default. Some students learn from the teacher at inputs with normal noise.",
+        "with `objective=[distillation]`, whose teacher is the ensemble. The divergence from the teacher has nine "
+        "tenths of the weight in the student's loss (the default), and the loss on the targets has one tenth. Some "
+        "students learn from the teacher at inputs with added normal noise.",
         "",
-        "A student costs a tenth of the ensemble's FLOPs, as one network does. On neither set is its log-likelihood "
-        "distinguishable from that of one network trained on the targets alone. On the moons the ensemble itself is "
-        "not significantly better than one network "
-        "either. On concrete the students do not reach the ensemble; with noise "
-        "on the inputs, their 90 % regions cover more of the test rows than without.",
+        "A student costs a tenth of the ensemble's FLOPs, as one network does. On neither data set is its "
+        "log-likelihood distinguishable from that of one network trained on the targets alone. On the moons the "
+        "ensemble itself is not significantly better than one network either. On concrete, the students have a lower "
+        "mean log-likelihood than the ensemble. If they learn from the teacher at noisy inputs, their 90 % regions "
+        "cover more of the test rows than without noise.",
         "",
         f"All numbers are means over {len(RUNS)} runs, and ± is the standard deviation over the runs. A difference is "
         "that of a method minus one network, paired by run, with its standard error. No setting was tuned.",
     ]
     texts = {
-        "moons": "The seed is also the seed of the data. The network has two layers of 512 units "
-        "(`experiment=moons/vanilla_512`), and the ensemble ten such networks (`experiment=moons/ensemble`). The "
-        "standard deviation of the noise is 0.5.",
-        "concrete": "The runs are the first standard splits. The ensemble is the recommended start for tables "
-        "(`experiment=uci/folds`, ten networks with two layers of 128 units, which train on the validation rows too). "
-        "One network and the students have the same layers and head, and train for 150 epochs with a cosine schedule. "
-        "Log-likelihoods are in nats and in the unit of the target. The noise on the standardised inputs has a "
-        "standard deviation of 0.1 (noisy inputs) or 0.5 (noisier inputs).",
+        "moons": "The seed of a run also determines its data. The network has two layers of 512 units "
+        "(`experiment=moons/vanilla_512`), and the ensemble consists of ten such networks "
+        "(`experiment=moons/ensemble`). The noise on the inputs has a standard deviation of 0.5.",
+        "concrete": "Each run has one of the first three standard splits. The ensemble is the recommended start for "
+        "tables (`experiment=uci/folds`, ten networks with two layers of 128 units, which train on the validation rows "
+        "too). One network and the students have the same layers and head, and train for 150 epochs with a cosine "
+        "schedule. Log-likelihoods are in nats and in the unit of the target. The noise on the standardised inputs has "
+        "a standard deviation of 0.1 (noisy inputs) or 0.5 (noisier inputs).",
     }
     for name in SETS:
         own = [row for row in rows if row["set"] == name]

@@ -219,10 +219,10 @@ def main() -> None:
         "the same batches. After the training, the largest difference of the predicted probability p(y|x) on 5000 "
         "test points is "
         + " and ".join(f"{gap:.1e} in {name}" for name, gap in gaps.items())
-        + ".\n\n**The test results of members have the same distribution as those of networks that are trained "
-        "alone, if each of these reads the batches in its own order.** The following list compares the negative "
-        "log-likelihood (NLL) on the test split after 60 epochs, as mean ± standard deviation over the networks. "
-        "The number p is the p-value of a Kolmogorov-Smirnov test against the members of the ensemble:\n"
+        + ".\n\n**The test results of members have the same distribution as those of networks that are trained alone, "
+        "if each network that is trained alone reads the batches in its own order.** The following list compares the "
+        "negative log-likelihood (NLL) on the test split after 60 epochs, as mean ± standard deviation over the "
+        "networks. The number p is the p-value of a Kolmogorov-Smirnov test against the members of the ensemble:\n"
         f"- 30 members of one ensemble: {format_mean(members)};\n"
         "- 30 networks trained alone, which have different initial weights but read the batches in the same order: "
         f"{format_mean(same_order)}, p = {stats.ks_2samp(members, same_order).pvalue:.2f};\n"  # type: ignore[attr-defined]

@@ -240,18 +240,20 @@ def write_page(rows: Sequence[Row]) -> None:
 
 PAGE = """# Effort for each sample
 
-How much faster are log-likelihoods if the number of points is decided for each sample, at the same error?
+This page shows how much faster log-likelihoods with the same error are computed if the number of points is decided for
+each sample.
 
     python -m benchmarks.densities.per_sample
 
-The heads `cvae` and `scvae` estimate an integral over a latent variable z. They use the same number of points z for
-all samples (`samples`), or they double the points of each sample until its estimated error is below `tolerance`. The
-data are synthetic: the angle with two modes of [latent](latent.md), whose heads are trained briefly here too. Errors
-are root mean squares over {items} test samples and {seeds} seeds of the difference from the integral by quadrature.
-Times are processor times of one thread while other work ran on the machine, medians of {rounds} interleaved rounds, in
-one batch of all test samples. The fixed numbers are powers of two, at which the points are most accurate. *Time saved*
-and *points saved* are the quotients of what a fixed number needs for the same error and what the tolerance needs; the
-curve of fixed numbers is interpolated in logarithms. "not known" stands for an error outside this curve.
+The heads `cvae` and `scvae` estimate an integral over a latent variable z. They use the same number of points z for all
+samples (`samples`), or they double the points of each sample until its estimated error is below `tolerance`. The data
+are synthetic: they are the angle with two modes of the page [latent](latent.md). The heads are trained briefly, as on
+that page. Errors are root mean squares over {items} test samples and {seeds} seeds of the difference from the integral
+by quadrature. Times are processor times of one thread while other work ran on the machine, medians of {rounds}
+interleaved rounds, in one batch of all test samples. The fixed numbers are powers of two, at which the points are most
+accurate. *Time saved* is the time that a fixed number of points needs for the same error, divided by the time with the
+tolerance. *Points saved* is the same quotient of the numbers of points. The results for fixed numbers are interpolated
+in logarithms. "not known" stands for an error outside the range of these results.
 
 {conclusion}
 

@@ -64,9 +64,10 @@ def page(rows: list[dict[str, Any]]) -> str:
         "# The main job in float32 and bfloat16: errors of whole runs over seeds",
         "",
         "The main job is `python -m framework experiment=pascal3d/scvae`. Here it runs with all its 30 epochs on its "
-        "generated images (synthetic), with `trainer.precision=32-true` and `trainer.precision=bf16-mixed`, and "
-        "without figures and tracking store (`pictures=false logger=none`). Errors are those of the 381 test images; "
-        "the error after ± in the first table is the standard error over these images.",
+        "generated images (synthetic), for each seed once with `trainer.precision=32-true` and once with "
+        "`trainer.precision=bf16-mixed`. The runs draw no figures and use no tracking store (`pictures=false "
+        "logger=none`). Errors are those of the 381 test images; the number after ± in the first table is the standard "
+        "error over these images.",
         "",
         f"| precision | seed | {' | '.join(ERRORS.values())} | processor time, s |",
         f"|---|---:|{'---:|' * (len(ERRORS) + 1)}",

@@ -314,10 +314,10 @@ SECTIONS = {
 HEAD = [
     "# An MLflow server on PostgreSQL",
     "",
-    "This page says whether all numbers and files of runs arrive at an MLflow server with a PostgreSQL database "
-    "and passwords if the server is killed while they run, and what such a server costs. Server, database and runs "
-    "share one machine. [docs/stores.md](../../docs/stores.md) says how to start the server. Command: "
-    "`python -m benchmarks.framework.stores`.",
+    "This page tests an MLflow server that has a PostgreSQL database and asks for passwords. It says whether all "
+    "numbers and files of runs arrive if the server is killed during the runs, and how much time and memory the server "
+    "takes. Server, database and runs share one machine. [docs/stores.md](../../docs/stores.md) says how to start the "
+    "server. Command: `python -m benchmarks.framework.stores`.",
 ]
 
 

@@ -119,10 +119,12 @@ def winners(runs: Mapping[str, list[tuple[Path, Mapping[str, Any]]]], costs: Map
     for method in sorted(runs, key=lambda method: costs[method]):
         if gaps[method] < best:
             best = gaps[method]
-            parts.append(f"{NAMES[method]} from {costs[method]:.2g} ms per image on ({best:.2f} nats)")
+            parts.append(
+                f"{NAMES[method]} from {costs[method]:.2g} ms per image on (distance {best:.2f} nats)"
+            )
     beaten = [NAMES[method] for method in runs if not any(NAMES[method] in part for part in parts)]
     return (
-        f"the nearest to the exact density is {', and '.join(parts)}. Each of the other methods "
+        f"the method that is nearest to the exact density is {', and '.join(parts)}. Each of the other methods "
         f"({', '.join(beaten)}) is slower than one of these and not nearer."
     )
 

@@ -186,9 +186,10 @@ def main() -> None:
         "parameters of the camera. For `texture` and `vertices, textured` the body has a smooth texture instead of "
         "colours: 3 changes of the texture, and the 8 deformations. `soft` draws no textures.",
         "",
-        "The last two columns of the table hold the time of forward and backward rendering in ms: for the loss and "
-        f"the body of this benchmark, and for a body with 6,890 vertices in {HEIGHT} × {WIDTH} pixels with the "
-        "gradient of its vertices. The time is the median processor time of 10 calls on one thread.",
+        "The last two columns of the table hold the time of forward and backward rendering in ms. The first of "
+        "them is for the loss and the body of this benchmark. The second is for a body with 6,890 vertices in "
+        f"{HEIGHT} × {WIDTH} pixels, with the gradient with respect to its vertices. "
+        "The time is the median processor time of 10 calls on one thread.",
         "",
         *table(rows),
         "",

@@ -215,11 +215,12 @@ def report(run: str, file: Path) -> str:
             "point is visible in both images and that are not near an outline. These are "
             f"{statistics.mean(covered):.1%} of a frame.",
             "",
-            "In the table, `mean difference` is the mean difference between an image and the warped previous image, "
-            "over the pixels visible in both, all pairs of images and all people, on the scale of 0 to 255 of sRGB "
-            "values. `SD over people` shows by how much this mean differs from person to person. `95th percentile` "
-            "is over the same pixels as the mean. The last column is the mean divided by the mean of the photographs. "
-            "The rows `mesh` are renders of the registered mesh with 1 or 4 × 4 samples a pixel.",
+            "In the table, `mean difference` is the difference between an image and the warped previous image, on the "
+            "scale of 0 to 255 of sRGB values. It is a mean over the pixels that are visible in both images, over all "
+            "pairs of images and over all people. `SD over people` shows by how much this mean differs from person to "
+            "person. `95th percentile` is over the same pixels as the mean. The last column is the mean divided by the "
+            "mean of the photographs. The rows `mesh` are renders of the registered mesh with 1 or 4 × 4 samples a "
+            "pixel.",
             "",
             "The photographs show how much of the difference between consecutive images is present in true images. "
             "Interpolation blurs fine patterns, cloth moves differently from the registered body, and the light "

@@ -338,9 +338,10 @@ def page(root: Path) -> None:
         "",
         "This page compares `experiment=uci/folds`, which has the settings of the recommended start for any table "
         "(`experiment=tabular/regression`), with other methods on four real data sets of the UCI repository and their "
-        "20 standard splits. One configuration is used for all sets and splits. It was chosen by the likelihood of "
-        "left-out training rows, except for the number of epochs: it was raised to 45 after test results of kin8nm "
-        "with 30 epochs (1.319) had been seen, so that its result on kin8nm depends a little on the test rows.",
+        "20 standard splits. One configuration is used for all sets and splits. All its settings except the number of "
+        "epochs were chosen by the likelihood of left-out training rows. The number of epochs was raised to 45 after "
+        "test results of kin8nm with 30 epochs (a log-likelihood of 1.319) had been seen. The result on kin8nm "
+        "therefore depends a little on the test rows.",
         "",
         "Log-likelihoods are means over the test rows of a split, in nats and in the unit of the target; higher is "
         "better. Each number is a mean over the splits, and ± is its standard error. Splits share rows, so the "

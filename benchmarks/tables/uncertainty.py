@@ -182,8 +182,8 @@ def page() -> None:
         "This page compares uncertainty wrappers and heads of this project by error against run time, on the *real* "
         f"UCI tables concrete and yacht (standard splits {', '.join(map(str, RUNS))}) and on the *synthetic* moons "
         f"with outliers (seeds {', '.join(map(str, RUNS))}). All methods train one layer of {WIDTH} units for {STEPS} "
-        f"steps of {BATCH} samples by AdamW (learning rate {RATE:g}, weight decay {DECAY:g}), with a cosine "
-        "schedule (swag: with a constant learning rate, which it needs). The weights after the last step are "
+        f"steps of {BATCH} samples by AdamW (learning rate {RATE:g}, weight decay {DECAY:g}), with a cosine schedule; "
+        f"only swag has a constant learning rate, because it needs one. The weights after the last step are "
         "tested. For the tables, the density head is `gaussian`, unless the method is itself a head: "
         "`evidential`, `student_t`, or `balance 0.5`, which is `gaussian` trained by the β-NLL with β = 0.5. For "
         "the moons, the head is `bernoulli`. No setting was tuned for any method. With three runs, differences "
@@ -191,10 +191,10 @@ def page() -> None:
         "",
         "![Log-likelihood against processor time](uncertainty.png)",
         "",
-        "The figure shows by how much the log-likelihood of a method is higher than that of one model without "
-        "any method in the same run, as a mean over the runs; the tables give standard errors. A method has one "
-        "point for each value of its knob: the number of draws of the weights or of dropout masks (1, 3, 10, "
-        "30), or of members (1, 2, 3, 5). Times are processor times of the density and the log-likelihood of a "
+        "The figure shows the gain of each method, as a mean over the runs: its log-likelihood minus that of one model "
+        "without any method in the same run. The tables give standard errors. A method has one point for each value of "
+        "its knob: the number of draws of the weights or of dropout masks (1, 3, 10, 30), or of members (1, 2, 3, 5). "
+        "Times are processor times of the density and the log-likelihood of a "
         f"row, in a batch of {ROWS} rows on one thread, as the median of {ROUNDS} repetitions; differences below "
         "a factor of two between methods without a knob are noise. Frozen and exported models are faster.",
         "",
