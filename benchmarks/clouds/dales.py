@@ -125,6 +125,9 @@ def draw(rows: Sequence[Mapping[str, Any]], title: str, path: Path, *, synthetic
                 label=result["method"],
             )
         axes.set_xscale("log")
+        ticks = [digit * 10.0**power for power in range(-3, 6) for digit in (1, 2, 5)]
+        low, high = (choose(result[key] for result in rows) for choose in (min, max))
+        axes.set_xticks([tick for tick in ticks if low / 2 <= tick <= high * 2])
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter("")
         axes.set_xlabel(label)
