@@ -372,7 +372,8 @@ def page(root: Path) -> None:
     lines += [
         "## Published means",
         "",
-        "These log-likelihoods are quoted from the papers. Not all papers use the same splits.",
+        "The log-likelihoods in this section are quoted from the papers of the methods. Not all papers use the same "
+        "splits.",
         "",
         f"| method | {' | '.join(SETS)} |",
         f"|---|{'---:|' * len(SETS)}",
