@@ -111,7 +111,10 @@ def conformal_coverage(model: Predictor, validation: dict[str, Tensor], test: di
     shares = []
     for number in range(test["target"].shape[1]):
         wrapped = Conformal(
-            lambda number=number: SingleParameter(model, number), miscoverage=0.1, score="mass"
+            lambda number=number: SingleParameter(model, number),
+            Target("real", ("parameter",)),
+            miscoverage=0.1,
+            score="mass",
         )
         wrapped.calibrate(batches(validation, number))
         inside = [wrapped(batch["input"]).contains(batch["target"]) for batch in batches(test, number)]
