@@ -26,7 +26,8 @@ def farthest(
     """
     if torch.compiler.is_exporting():
         raise ConfigError(
-            "The order of the farthest points is found step by step, for which ONNX has no operation."
+            "The order of the farthest points cannot be exported, because it is found step by step, for which ONNX "
+            "has no operation. For an export, train a model with another encoder."
         )
     from framework.geometry.farthest_compiled import farthest as compiled
 

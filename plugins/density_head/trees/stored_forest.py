@@ -31,7 +31,7 @@ def require_forest(arrays: Mapping[str, np.ndarray], classes: int, numbers: int)
             if arrays[name].size
         ]
         if filled or read:
-            reason = f"{', '.join(filled)} is not empty" if filled else "`read` is not 0"
+            reason = f"these arrays hold numbers: {', '.join(filled)}" if filled else "`read` is not 0"
             raise ValueError(f"the forest has no nodes (`feature` is empty), but {reason}")
         return
     _require_shape(arrays, "threshold", (len(feature),))

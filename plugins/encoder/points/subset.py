@@ -38,7 +38,7 @@ def choose_points(
         if torch.compiler.is_exporting():
             raise ConfigError(
                 "A random choice of points cannot be exported, because it depends on the number of points of each "
-                "cloud. Train the model with another choice of points."
+                "cloud. For an export, train a model with another encoder."
             )
         rows = [_random(size, count, seed) for size in counts.tolist()]
         return torch.stack(rows).to(clouds.device) if rows else counts.new_zeros(0, count)
