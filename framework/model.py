@@ -277,7 +277,7 @@ def one_pass(predictor: Predictor, caches: Sequence[SharedResult[Any]] | None = 
 
 
 def shared_results(predictor: Predictor) -> list[SharedResult[Any]]:
-    """Return the caches of all modules of a predictor (`one_pass`)."""
+    """Return the caches through which modules of a predictor share results within a block of `one_pass`."""
     candidates = (getattr(module, "shared_result", None) for module in predictor.modules())
     return [cache for cache in candidates if isinstance(cache, SharedResult)]
 

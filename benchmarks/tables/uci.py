@@ -363,7 +363,8 @@ def page(root: Path) -> None:
         "the one command that makes them; two such commands ran at a time, with one thread each. Other programs "
         "used the machine at the same time, so that this time is an upper bound. The time of a prediction is the "
         "processor time of a row in a batch of 2000 rows by the frozen model on one thread, a median over "
-        f"{TIMED} splits; the last column also includes the computation of the median. A run trains at least 3000 "
+        f"{TIMED} splits; the last column also includes the point prediction, which is the median of "
+        "the density. A run trains at least 3000 "
         f"steps and {epochs_of(rows)} epochs.",
         "",
     ]

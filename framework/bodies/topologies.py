@@ -123,7 +123,7 @@ def sheet(body: Body, stages: int = 2) -> Sheet:
 def topology(body: Body, surface: Sheet, name: Name) -> Topology:
     """Return the topology called `name`: the body decimated, unchanged, or with its longest edges split.
 
-    `surface` is the sheet of the body, from which the vertices are taken.
+    `surface` is the sheet of the body: its mesh with all edges split. The vertices are taken from it.
 
     The name stands for a number of vertices (COUNTS). For "7k", a body that has fewer vertices stays unchanged. For
     "27k" edges are split once at most and for "110k" twice at most, so a small body can have fewer vertices than the
@@ -189,10 +189,10 @@ def recognise_topology(
 def body_in_topology(body: Body, surface: Sheet, mesh: Topology) -> Body:
     """Return a body model whose vertices are those of the topology `mesh`; it has no texture coordinates.
 
-    `surface` is the sheet of the topology. A vertex of the body keeps its template position, its displacements by shape
-    and its skinning weights. For a new vertex, at the midpoint of an edge, each of these is the mean over both ends of
-    the edge. Where the pose bends the surface, the skinned midpoint is therefore not exactly the middle of the posed
-    edge.
+    `surface` is the sheet from which the topology was taken: the mesh of `body` with all edges split. A vertex of the
+    body keeps its template position, its displacements by shape and its skinning weights. For a new vertex, at the
+    midpoint of an edge, each of these is the mean over both ends of the edge. Where the pose bends the surface, the
+    skinned midpoint is therefore not exactly the middle of the posed edge.
     """
     parts = {
         part: surface.interpolate(getattr(body, part))[mesh.rows]

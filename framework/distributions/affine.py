@@ -36,11 +36,11 @@ class AffineDensity(DerivedDensity):
         return self.scale.log().sum(-1)
 
     def inner(self, value: Tensor) -> Tensor:
-        """Return the value of Y that belongs to the value `value` of X: (value - location) / scale."""
+        """Return the value of the base density for a value of this density: (value - location) / scale."""
         return (value - self.location) / self.scale
 
     def outer(self, value: Tensor) -> Tensor:
-        """Return the value of X that belongs to the value `value` of Y: location + scale · value."""
+        """Return the value of this density for a value of the base density: location + scale · value."""
         return self.location + self.scale * value
 
     def log_prob(self, value: Tensor) -> Tensor:

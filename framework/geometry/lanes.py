@@ -155,21 +155,30 @@ def coded(result, arguments, make):
 @intrinsic
 @no_type_check
 def least(typing, a, b):
-    """Return the smaller number of a and b in each lane; b if a is NaN."""
+    """Return the smaller number of a and b in each lane; b if a is NaN.
+
+    Call it as `least(a, b)`; numba passes `typing`.
+    """
     return coded(a, (a, b), lambda builder, x, y: least_of(builder, a.element, x, y))
 
 
 @intrinsic
 @no_type_check
 def most(typing, a, b):
-    """Return the larger number of a and b in each lane; b if a is NaN."""
+    """Return the larger number of a and b in each lane; b if a is NaN.
+
+    Call it as `most(a, b)`; numba passes `typing`.
+    """
     return coded(a, (a, b), lambda builder, x, y: most_of(builder, a.element, x, y))
 
 
 @intrinsic
 @no_type_check
 def where(typing, truth, a, b):
-    """Return a in lanes where `truth` is true, and b in the other lanes."""
+    """Return a in lanes where `truth` is true, and b in the other lanes.
+
+    Call it as `where(truth, a, b)`; numba passes `typing`.
+    """
     return coded(a, (truth, a, b), lambda builder, t, x, y: builder.select(t, x, y))
 
 
@@ -179,6 +188,8 @@ def fma(typing, a, b, c):
     """Return a·b + c, rounded once if the processor has a fused multiply-add, otherwise after each step.
 
     All calls on one machine round in the same way.
+
+    Call it as `fma(a, b, c)`; numba passes `typing`.
     """
     kind = {types.float32: "f32", types.float64: "f64"}[a.element]
 
@@ -194,7 +205,10 @@ def fma(typing, a, b, c):
 @intrinsic
 @no_type_check
 def splat(typing, number):
-    """Return a vector with the number in every lane."""
+    """Return a vector with the number in every lane.
+
+    Call it as `splat(number)`; numba passes `typing`.
+    """
 
     def generate(context, builder, sig, values):
         vector = context.get_value_type(sig.return_type)
@@ -238,14 +252,20 @@ def folded(vector, combine):
 @intrinsic
 @no_type_check
 def lowest(typing, vector):
-    """Return the smallest number of all lanes."""
+    """Return the smallest number of all lanes.
+
+    Call it as `lowest(vector)`; numba passes `typing`.
+    """
     return folded(vector, least_of)
 
 
 @intrinsic
 @no_type_check
 def highest(typing, vector):
-    """Return the largest number of all lanes."""
+    """Return the largest number of all lanes.
+
+    Call it as `highest(vector)`; numba passes `typing`.
+    """
     return folded(vector, most_of)
 
 

@@ -226,7 +226,8 @@ def for_training(config: Config) -> Session:
     if trains_itself is not None and reader is not None:
         raise ConfigError(
             f"{type(reader).__name__} reads the training split of the model that it wraps, but "
-            f"{type(trains_itself).__name__} trains models on parts of it. Leave one of the two out of uncertainty."
+            f"{type(trains_itself).__name__} trains each model on a part of this split. Leave one of the two out of "
+            "`uncertainty`."
         )
     if trains_itself is not None and not resumed:
         _refuse_training(config, f"{type(trains_itself).__name__} trains its models itself")

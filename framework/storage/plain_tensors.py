@@ -153,7 +153,7 @@ def require_dense(content: Any, size: int | float = math.inf) -> None:
         size: Bytes of the file.
 
     Raises:
-        Foreign: A tensor has another layout, data type or class.
+        Foreign: A tensor is not dense, or its data type or class is not one of those that this module reads.
         ValueError: A tensor has far more elements than its storage, or all tensors have far more bytes than the file.
     """
     visited: set[int] = set()

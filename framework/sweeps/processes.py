@@ -126,8 +126,9 @@ class Forks:
     """Starter of jobs as forks of one server process (`fork_server`), which is started with the first job; Linux only.
 
     A fork differs from a new process (`SeparateProcess`) only in that the modules are already imported. If the server
-    dies, its running jobs receive a signal to end, and jobs that it had not started yet get new processes. Jobs that
-    are started later get another server or, if the dead server had forked no job at all, new processes.
+    dies, its running jobs receive a signal to end. Jobs that had been sent to it, but had not started, run as new
+    processes. For all later jobs another server is started; only if the dead server had never forked a job, they run as
+    new processes too.
 
     Args:
         modules: Modules that the server imports.

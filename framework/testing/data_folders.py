@@ -216,8 +216,8 @@ def first_match(folder: Path, pattern: str) -> Path:
 def configured_row(row: DataRow, own: Mapping[str, Any]) -> DataRow:
     """Return a contract row with the parameters of `row`, overridden by a user's parameters `own`.
 
-    If `own` locates the data, only the limits and the properties left out are kept from `row`. The files are then the
-    user's own: they are read but not damaged, and the row does not know their columns.
+    If `own` locates the data, only the limits and the list of properties that are not tested are taken from `row`. The
+    files are then the user's own: they are read but not damaged, and the row does not know their columns.
     """
     with TemporaryDirectory() as folder:
         location_keys = {"root", *(row.write(Path(folder)) if row.write else ())}

@@ -41,7 +41,7 @@ class Example(Uncertainty):
         return torch.stack([member.loss(inputs, target) for member in self.members]).mean(0)
 
     def training_densities(self, inputs: Tensor) -> Distribution:
-        """Return the densities that an objective may shape."""
+        """Return the densities for a batch of inputs, with the gradients that an objective needs."""
         return self(inputs)
 
     def calibrate(self, batches: Iterable[Batch]) -> None:

@@ -107,7 +107,9 @@ def fingerprint(version: str, splits: Sequence[Fields], **parameters: object) ->
 
 
 def read_points(files: Sequence[Path]) -> Fields:
-    """Read the columns `x` and `y` of CSV files, in standard units, one sample for each row.
+    """Read the columns `x` and `y` of CSV files, one sample for each row.
+
+    The numbers are used as they are, so that they must be in the units of the training inputs.
 
     Raises:
         DataError: There is no file, or a file cannot be read, lacks a column, or holds a cell that is not a finite

@@ -72,7 +72,7 @@ class Framing:
     margin: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False)] = 0.1
 
     def crop(self, annotation: Annotation) -> Crop:
-        """Return the settings that read the crop of an annotated object from its image."""
+        """Return the settings with which the crop around an annotated object is read from its image."""
         return Crop(annotation.image, annotation.box, self.margin, self.image_size)
 
     def scale(self, box: Box) -> float:

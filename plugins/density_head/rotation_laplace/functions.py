@@ -61,13 +61,15 @@ def log_normaliser(parameter: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*ba
 
 @torch.no_grad()
 def log_node_weights(falls: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor]:
-    """Return the nodes s of the integral for the normaliser F(A), and the logarithms of their terms.
+    """Return the nodes s of the quadrature for the normaliser F, and the logarithms of their terms.
+
+    F is an integral over s > 0 that depends on the parameter of the density only through λ. It is the sum of the terms.
 
     Args:
-        falls: λ, the rates at which the log-density falls along the components of the aligned quaternion, ascending.
+        falls: λ, the rates at which the log-density falls along the three axes of rotation of its mode, ascending.
 
     Returns:
-        s, (node,), and the logarithm of the term of each node in the sum for F(A), (*batch, node).
+        s, (node,), and the logarithm of the term of each node, (*batch, node).
     """
     scale, log_part = _scales(falls)
     log_mean, _ = _log_mean(falls.unsqueeze(-2) * scale.unsqueeze(-1), moments=False)

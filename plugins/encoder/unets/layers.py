@@ -136,25 +136,26 @@ class Layer(nn.Module):
 class FromGround(torch.autograd.Function):
     """The function relu(gain s + offset) minus its value on the background, where s are the standardised maps.
 
-    The maps are 0 on the empty background. The backward pass is written out, because autograd of the same formula makes
-    many more passes over the maps. Mean and variance, and with them the value on the background, are functions of the
-    maps; the backward pass takes this into account.
+    The background is the part of an image in which the maps are 0; there, s is -mean · inverse standard deviation. The
+    backward pass is written out, because autograd of the same formula makes many more passes over the maps. Mean and
+    variance, and with them the value on the background, are functions of the maps; the backward pass takes this into
+    account.
     """
 
     @staticmethod
     def forward(
         ctx: Any, maps: Tensor, gain: Tensor, offset: Tensor, standard: Tensor, mean: Tensor, inverse: Tensor
     ) -> Tensor:
-        """Return the maps after ReLU, minus the value on the background.
+        """Return relu(gain s + offset) minus the value of this function on the background.
 
         Args:
             ctx: context of autograd.
             maps: maps before normalisation.
             gain: factor of each channel.
             offset: summand of each channel.
-            standard: standardised maps.
-            mean: mean of each channel.
-            inverse: inverse standard deviation of each channel.
+            standard: s, the standardised maps: (maps - mean) · inverse.
+            mean: mean of each channel, for the value on the background and for the gradients.
+            inverse: inverse standard deviation of each channel, for the same purpose.
         """
         shift = offset - gain * mean * inverse
         ground = shift.relu()
