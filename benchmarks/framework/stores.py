@@ -164,7 +164,8 @@ def measure_loss(server: StoreServer) -> list[str]:
     if last != after:
         raise RuntimeError(f"the second mode=sync has changed the store: {after} became {last}")
     return [
-        f"{sweep.text()} ran for {seconds:.0f} s. The server was killed {reached}. The server was started again "
+        f"{sweep.text()} ran for {seconds:.0f} s. The server was killed {reached}. The command then tried to "
+        "send the remaining lines until it gave up. The server was started again "
         f"after the end of the command; the store lacked {before.lost:,} numbers and {before.files_lost} files. "
         f"Then `python -m framework mode=sync mode.run=<folder of the sweep>` sent {sent:,} lines in "
         f"{duration:.0f} s. Repeated, it sent {again} lines and changed nothing. The journals were compared with "
