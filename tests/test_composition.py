@@ -24,6 +24,7 @@ from framework.configuration.composition import (
     plain,
     register,
 )
+from framework.configuration.config import Config
 from framework.configuration.settings import (
     PRECISIONS,
     STRATEGIES,
@@ -388,3 +389,27 @@ def test_a_preset_is_that_of_the_data_however_it_is_chosen(given: str, wanted: s
 def test_a_preset_of_several_data_sets_is_refused() -> None:
     with pytest.raises(ConfigError, match="preset=thesis means several presets for these experiments"):
         command_line(["-m", "experiment=choice(pascal3d/scvae,moons/ensemble)", "preset=thesis"])
+
+
+@pytest.mark.parametrize(
+    ("experiment", "wrappers", "name"),
+    [
+        ("moons/ensemble", None, "ensemble"),
+        ("moons/ensemble", "[ensemble,temperature]", "ensemble + temperature"),
+        ("moons/vanilla_128", "[temperature]", "vanilla_128 + temperature"),
+        (None, "[temperature]", "bernoulli + temperature"),
+    ],
+)
+def test_the_name_of_a_method_holds_each_part_once(
+    experiment: str | None, wrappers: str | None, name: str, tmp_path: Path
+) -> None:
+    from framework.runs.session import method_of
+
+    arguments = (
+        [f"experiment={experiment}"]
+        if experiment
+        else ["data=moons", "density_head=bernoulli", "encoder=[mlp]"]
+    )
+    arguments += [f"uncertainty={wrappers}"] if wrappers else []
+    config = Config.of({**plain(composed(*arguments)), "experiment_name": experiment}, tmp_path, arguments)
+    assert method_of(config, config.assembly.parts) == name

@@ -364,13 +364,14 @@ def method_of(config: Config, parts: Resolved) -> str:
     """Return the name of a model in tables.
 
     The name is that of the experiment, or of the density head if there is no experiment, followed by the uncertainty
-    wrappers. Wrappers that are part of the experiment are not listed.
+    wrappers. Wrappers that are part of the experiment are not listed, and neither is the one that the experiment is
+    named after.
     """
     name = config.settings.experiment_name
     method = name.rpartition("/")[2] if name else str(parts["density_head"]["name"])
     changed = any(item.lstrip("+~").startswith("uncertainty") for item in config.overrides)
     wrappers = [part["name"] for part in parts["uncertainty"]] if changed or not name else []
-    return " + ".join([method, *wrappers])
+    return " + ".join([method, *(wrapper for wrapper in wrappers if wrapper != method)])
 
 
 def add_test_parts(session: Session) -> Session:
