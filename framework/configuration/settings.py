@@ -117,7 +117,8 @@ class OptimizerSettings(_Strict):
         """
         if isinstance(self.learning_rate, str):
             raise ConfigError(
-                "optimizer.learning_rate = 'auto' is found before a training by gradient only. Set it to a number."
+                "optimizer.learning_rate = 'auto' applies only to models that are trained by gradient descent in this "
+                "command. Set it to a number."
             )
         return self.learning_rate
 

@@ -87,7 +87,7 @@ class Shards:
             return torch.from_numpy(array)
 
     def batches(self, number: int, batch_size: int) -> Iterator[Tensor]:
-        """Yield the inputs of shard `number` in batches, without last rows that are padding in all its clouds."""
+        """Yield the inputs of shard `number` in batches, each without last rows that are padding in all its clouds."""
         for batch in self.read(number).split(batch_size):
             yield trim(batch)
 

@@ -274,7 +274,8 @@ def _decode(row: int, text: Any) -> bytes:
         return base64.b64decode(text, validate=True)
     except (binascii.Error, TypeError, ValueError) as error:
         raise DataError(
-            f"row {row}: the content of a file must be text in base64. Pass a file of your own as pathlib.Path."
+            f"row {row}: the content of a file must be text in base64. Encode it so; in Python, you may "
+            "instead pass the path of the file as pathlib.Path."
         ) from error
 
 

@@ -126,7 +126,11 @@ def align(parameter: Float[Tensor, "*batch 3 3"]) -> Frame:
 
 @torch.no_grad()
 def log_height(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-    """Return -log k(λ), the log-density at the mode of a matrix Fisher density with λ = `falls`, nats, float64."""
+    """Return the log-density at the mode of a matrix Fisher density, nats, float64.
+
+    It is -log k(λ), where k is the normaliser and λ = `falls` are the rates at which the log-density falls from the
+    mode (see the module's docstring).
+    """
     return -_quadrature(falls)[2].sum(-1).log()
 
 

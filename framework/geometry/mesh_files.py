@@ -86,7 +86,7 @@ def line_numbers(
     Args:
         content: bytes of the file.
         comment: sign at which a comment begins; None if there are no comments.
-        names: first words of lines that are kept whole.
+        names: first words of lines in which a comment sign is an ordinary character.
         key: if not empty, only lines with this first word are counted.
         first: number of counted lines before the line with index 0.
     """

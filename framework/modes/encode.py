@@ -126,7 +126,9 @@ class Files:
 
 @dataclass(frozen=True)
 class Collection:
-    """Samples to encode, and the folder for their features. The features of a part are written to one file.
+    """Samples to encode, in parts, and the folder for their features.
+
+    A part is a shard, or a fixed number of consecutive files. Its features are written to one file.
 
     Attributes:
         source: The samples.

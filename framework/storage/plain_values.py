@@ -165,7 +165,8 @@ def require_plain_pickle(pickled: bytes, called: Collection[str] = (), named: Co
 
     Args:
         pickled: Bytes of one pickle.
-        called: Globals that the pickle may name and call, as "module name" of Python 3.
+        called: Globals that the pickle may name and call, each as its module and its name in Python 3,
+            with a blank between them.
         named: Globals that the pickle may name but not call.
 
     Raises:

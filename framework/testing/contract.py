@@ -68,10 +68,10 @@ def contract(group: str, name: str, config: Mapping[str, Any] | None = None) -> 
 
     No row is added if `config` is None, or if it equals the configuration of a shipped row or the defaults. If the
     plugin ships rows, the added row is a copy of one of them with the parameters of `config`. A row whose nested
-    plugins have the same names as in `config` is copied; if there is none, the first row whose target the configured
-    plugin accepts is copied. The copy keeps the target and the properties that are left out, but not the reference
-    cases. If the plugin ships no rows, rows are made for the default targets or input shapes. Data sets use
-    `configured_row`.
+    plugins have the same names as in `config` is copied; if there is none, the first row whose target the
+    configured plugin accepts is copied. The copy keeps the target and the list of properties that are not tested,
+    but not the reference cases. If the plugin ships no rows, rows are made for the default targets or input shapes.
+    Data sets use `configured_row`.
 
     Args:
         group: Name of the registry.

@@ -63,7 +63,7 @@ class HeadSubject:
         return torch.randn(*batch, *self.raw_shape, generator=generator)
 
     def scaled_parameters(self, sizes: Sequence[float]) -> Tensor:
-        """Return raw parameters for one sample of each size, (sample, *raw_shape), float64."""
+        """Return random raw parameters, multiplied by a factor of `sizes` for each sample, (sample, *raw_shape)."""
         factors = torch.tensor(sizes, dtype=torch.float64)
         return self.raw_parameters(len(sizes)).double() * factors.view(-1, *[1] * len(self.raw_shape))
 

@@ -70,7 +70,7 @@ class DrawnGrid:
     root: Tensor
 
     def standardise(self, value: Tensor) -> Tensor:
-        """Return values, (draws, *batch, number), as standard numbers."""
+        """Return values, (draws, *batch, number), minus the grid's centre and times the inverse of its root."""
         offset = (value.double() - self.centre).movedim(0, -1)
         return torch.linalg.solve_triangular(self.root.mT, offset, upper=False).movedim(-1, 0)
 

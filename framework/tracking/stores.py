@@ -134,7 +134,8 @@ def _require_driver(uri: str) -> None:
 def sqlite_uri(path: Path) -> str:
     """Return the address of an SQLite store, escaped if its path contains a character with a special meaning.
 
-    Slashes are then escaped too, because MLflow creates the folder in the address before it decodes the address.
+    Slashes are then escaped too. Otherwise MLflow, which creates the folder named in the address before it decodes the
+    address, would create a folder with an escaped name.
     """
     return _SQLITE + (quote(os.fsencode(path), safe="") if re.search(_MEANING, str(path)) else str(path))
 

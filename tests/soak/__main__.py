@@ -41,11 +41,14 @@ TIMES = 3
 
 
 EVENT_ROWS = (
-    "Three kinds of event are more than one killed command. *Two sweeps* share a folder and a job; the first is "
-    "killed and repeated, and every job must exist once and equal an undisturbed one. *The store and the run*: the "
-    "server of the store is killed, then the run; the run is resumed, the server starts again, and every number of "
-    "the journal must be in the store once. The script that makes the thesis's tables is killed while it runs a "
-    "sweep, and none of its processes may be left 10 s later.",
+    "In three kinds of event more happens than the kill of a single command:",
+    "",
+    "- *Two sweeps*: they share a folder and a job. The first sweep is killed and repeated. Every job must exist once, "
+    "with the results of an undisturbed job.",
+    "- *The store and the run*: the server of the store is killed, then the run. The run is resumed, and the server "
+    "starts again. Every number of the journal must be in the store once.",
+    "- *The tables of the thesis*: the script that makes them is killed while it runs a sweep. None of its processes "
+    "may be left 10 s later.",
     "",
     "| event | repetitions | kills | with a fault |",
     "|---|---:|---:|---:|",

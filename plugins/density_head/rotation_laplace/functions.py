@@ -1,7 +1,8 @@
 """The rotation Laplace density p(R) = exp(-d) / (d F(A)) with d² = tr(S - AᵀR) + δ² (Yin et al. 2023, Def. 3).
 
-A = U S Vᵀ is the proper singular value decomposition. With the aligned quaternion q of UᵀRV and the falls λ of
-`framework.geometry.aligned_rotations`, tr(S - AᵀR) = u = Σ λᵢqᵢ². The density of the paper has δ = 0 and is infinite at
+A = U S Vᵀ is the proper singular value decomposition, and F(A) is the normaliser. q is the quaternion of UᵀRV, called
+aligned because it is 1 at the mode. With λ, the falls of `framework.geometry.aligned_rotations` (2(s₂+s₃), 2(s₁+s₃),
+2(s₁+s₂) for the singular values s), tr(S - AᵀR) = u = Σ λᵢqᵢ². The density of the paper has δ = 0 and is infinite at
 the mode. With δ = SOFTENING, the density is finite, and differs from the paper's density only for u of the order of δ².
 
 **The normaliser.** For d > 0 (Gradshteyn & Ryzhik 2007, 3.471.15)

@@ -99,9 +99,9 @@ def chebyshev_series(low: Real, high: Real, which: int) -> list[Real]:
 def degree(series: list[Real], pieces: Real, tolerance: Real) -> int:
     """Return the smallest degree at which a Chebyshev series on a piece of the length 1 / `pieces` may be cut.
 
-    The terms that are cut must add up to less than the tolerance, and their derivatives in v to less than four times
-    the tolerance. The second bound limits the error of v/4 + v² G'(v)/2 = 1 - A(κ), which is computed from the
-    derivative of the polynomial G.
+    The series approximates the function G(v) of the module's docstring. The terms that are cut must add up to less than
+    the tolerance, and their derivatives in v to less than four times the tolerance. The second bound limits the error
+    of the mean resultant length A(κ), which is computed from the derivative of G: 1 - A(κ) = v/4 + v² G'(v)/2.
     """
     return next(
         d

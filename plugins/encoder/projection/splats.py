@@ -57,13 +57,13 @@ def compute_surface(
 ) -> Float[Tensor, "batch 5 height width"]:
     """Return images of the surface through the points that the images of `encoder.project` show.
 
-    Each point has a cone of radius `radius` around itself, which hides the points behind the cone. With each pixel of
-    distance from the point, the depth of the cone grows by the width of a pixel. In each pixel, the nearest cone gives
-    the depth of the surface and the distance, in pixels, to the cone's point. The fifth channel is this distance as a
-    share of radius + 1, or 1 if no point is within `radius`. The first four channels are the mean of the points of the
-    surface within `radius`, weighted by a Gaussian that is wider if the cone's point is farther away. In pixels that
-    do not belong to the subject these four channels are 1. The pixels of the subject are those that show a point, with
-    the gaps between them filled by a morphological closing.
+    Each point has a cone of radius `radius` around itself, which hides the points behind the cone. With each pixel
+    of distance from the point, the depth of the cone grows by the width of a pixel. In each pixel, the nearest cone
+    gives the depth of the surface and the distance, in pixels, to the cone's point. The fifth channel is this
+    distance as a share of radius + 1, or 1 if no point is within `radius`. The first four channels are the mean of
+    the points of the surface within `radius`, weighted by a Gaussian that is wider the more pixels the cone's point
+    is away. In pixels that do not belong to the subject these four channels are 1. The pixels of the subject are
+    those that show a point, with the gaps between them filled by a morphological closing.
 
     On the CPU the function is compiled unless a gradient is required. All implementations give the same bits. The
     result is differentiable in the channels of the images, but not in the set of visible points.

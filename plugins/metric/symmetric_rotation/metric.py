@@ -117,7 +117,10 @@ class SymmetricRotation(Mean):
 
 
 def rotation_log_prob(prediction: Prediction) -> Float[Tensor, "batch"]:
-    """Return the log-density of the targets as rotations, with respect to a volume of π², nats, float64."""
+    """Return the log-density of the targets as rotations, nats, float64.
+
+    The density is with respect to the rotation-invariant measure whose total is π², as in Murphy et al. 2021.
+    """
     support = prediction.density.support
     log_prob = prediction.log_prob.double()
     if isinstance(support, Circular) and support.ranges is None:

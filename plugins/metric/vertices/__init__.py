@@ -1,1 +1,1 @@
-"""Distances between predicted and true vertices, and errors of correspondences through predicted meshes."""
+"""Distances between predicted and true vertices, and errors of the matches between scans that predicted meshes give."""

@@ -234,7 +234,7 @@ def find_exit(screen, faces, index, facing, row, column, other_row, other_column
         screen: see `raster`.
         faces: (faces, 3), indices of vertices.
         index: the face.
-        facing: `signed_area` of a face of the same surface.
+        facing: `signed_area` of a face of the same surface; its sign tells on which side of an edge the face lies.
         row: row of the first pixel.
         column: column of the first pixel.
         other_row: row of the other pixel.
