@@ -71,7 +71,7 @@ trainer.gradient_clip_val=-1 | trainer.gradient_clip_val = -1
 +trainer.gradient_clip_algorithm=nrm | Did you mean 'norm'?
 trainer.patience=0 | trainer.patience = 0
 trainer.keep=beest | Did you mean 'best'?
-+trainer.callbacks=[x] | trainer.callbacks: unknown key
++trainer.callbacks=[x] | there is no callback 'x'. The callbacks are early_stopping, weight_averaging
 +trainer.accumulate_grad_batches=0 | trainer.accumulate_grad_batches = 0
 +trainer.deterministic=maybe | trainer.deterministic = 'maybe'
 +trainer.max_time=soon | trainer.max_time = 'soon'
