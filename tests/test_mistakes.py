@@ -328,12 +328,15 @@ DAMAGED = {
     "nothing": (b"", r"chosen as experiment sets nothing at the top level"),
     "other package": (b"# @package nosuch\nseed: 1\n", r"nosuch: unknown key"),
     "unknown key": (TOP + b"seeds: 1\n", r"seeds: unknown key\. Did you mean 'seed'\?"),
-    "open interpolation": (TOP + b"seed: ${oops\n", r"In 'experiment/mine': no viable .* \(at seed\)"),
+    "open interpolation": (
+        TOP + b"seed: ${oops\n",
+        r"mine\.yaml contains '\$\{oops', which may read more than the config",
+    ),
     "interpolation": (
         TOP + b"seed: ${nosuch.key}\n",
         r"'nosuch\.key' not found \(at seed\)\. Give the missing key a value",
     ),
-    "resolver": (TOP + b"seed: ${nosuch:key}\n", r"Unsupported interpolation type nosuch \(at seed\)"),
+    "resolver": (TOP + b"seed: ${nosuch:key}\n", r"mine\.yaml contains '\$\{nosuch:key\}', which may read"),
     "defaults is text": (
         TOP + b"defaults: moons\n",
         r"'experiment/mine', defaults must be a list .*A config consists",
