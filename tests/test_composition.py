@@ -108,11 +108,12 @@ REFUSED = {
     "coil20": "data.root is not set",
     "dales": "data.root is not set",
     "images": "data.root is not set",
+    "moons/distillation": "objective.distillation.teacher is null",
     "tabular": "data.path is not set",
     "uci": "data.root is not set",
     "smplpix/thesis": "objective.perceptual.weights is null",
 }
-"""Messages of the experiments that require files of the user, by the beginning of the experiment's name."""
+"""Messages of the experiments that require files or a run of the user, by the beginning of the experiment's name."""
 
 
 HUGE = {"registration/large"}
