@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from framework.errors import DataError, escape_unprintable, quote, shorten
-from framework.reports.table import COST_COLUMNS, Better, aggregate, machine
+from framework.reports.table import COST_COLUMNS, SPREADS, Better, aggregate, machine
 from framework.runs.job import read_record
 from framework.storage.plain_values import is_number, read_json, read_yaml
 from framework.storage.reading import RESTORE
@@ -177,12 +177,19 @@ def _check_results(results: Mapping[str, Any], path: Path) -> dict[str, Any]:
     }
     if isinstance(columns, dict):
         valid |= {key: results[key] is None or is_number(results[key]) for key in columns if key in results}
+        spreads = [key + ending for key in columns for ending in SPREADS if key + ending in results]
+        valid |= {key: _is_spread(results[key]) for key in spreads}
     if invalid := [key for key, is_valid in valid.items() if not is_valid]:
         raise DataError(
             f"{path} has the invalid value {shorten(invalid[0])} = {quote(results.get(invalid[0]))}. {RESTORE}"
         )
     plain = {key: shorten(value) if isinstance(value, str) else value for key, value in results.items()}
     return {**plain, "columns": {key: shorten(heading) for key, heading in columns.items()}}
+
+
+def _is_spread(value: Any) -> bool:
+    """Return whether a value is a standard error or deviation, NaN, or None."""
+    return value is None or (is_number(value) and not value < 0)
 
 
 def _varied_keys(overrides: Sequence[Sequence[str]], *, absent: bool = False) -> list[str]:
