@@ -79,6 +79,7 @@ def test_numba_itself_keeps_no_code() -> None:
     assert own == []
 
 
+@pytest.mark.slow
 def test_kernels_work_where_no_folder_can_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     nowhere = str(tmp_path / "file" / "below")

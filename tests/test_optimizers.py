@@ -247,7 +247,7 @@ def test_fixed_features_are_computed_once_a_step(direct: bool, wrapper: str | No
 @pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning", "ignore:.*lr_scheduler.step:UserWarning")
 @pytest.mark.parametrize("algorithm", ["norm", "value"])
 @pytest.mark.parametrize("precision", ["32-true", "64-true", "bf16-mixed", "16-mixed"])
-@pytest.mark.parametrize("members", [1, 3])
+@pytest.mark.parametrize("members", [1, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", OPTIMIZERS)
 def test_gradients_are_clipped_in_every_precision(
     name: str, members: int, precision: Any, algorithm: str

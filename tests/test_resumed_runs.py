@@ -71,7 +71,9 @@ def numbers(folder: Path) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("place", ["calibrate", "save", "report_test"])
-@pytest.mark.parametrize("how", [Stopped(signal.SIGTERM), OSError("disk")], ids=repr)
+@pytest.mark.parametrize(
+    "how", [Stopped(signal.SIGTERM), pytest.param(OSError("disk"), marks=pytest.mark.slow)], ids=repr
+)
 def test_a_calibration_that_was_stopped_leaves_the_model_whole_and_can_be_repeated(
     place: str, how: BaseException, tmp_path: Path, composed: Composed
 ) -> None:

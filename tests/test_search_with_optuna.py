@@ -276,6 +276,7 @@ class OptunaSearch(Search):
         return subprocess.Popen(command, cwd=self.home, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
 
 
+@pytest.mark.slow
 def test_a_killed_search_goes_on_with_two_commands_at_once(tmp_path: Path) -> None:
     search = OptunaSearch(tmp_path)
     with search.begin(*NSGA2, "hydra.sweeper.trials=8") as killed:

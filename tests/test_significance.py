@@ -41,7 +41,7 @@ def test_the_scale_does_not_matter(scale: float) -> None:
 
 
 @pytest.mark.parametrize("runs", [1, 2, 3, 5, 10])
-@pytest.mark.parametrize("methods", [2, 3])
+@pytest.mark.parametrize("methods", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_of_equal_methods_at_most_one_table_in_twenty_has_a_bold_row(runs: int, methods: int) -> None:
     """Count over 10,000 random tables; a single run has the standard error over its test samples."""
     random = np.random.default_rng(0)

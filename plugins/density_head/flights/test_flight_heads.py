@@ -38,7 +38,7 @@ def test_heads_refuse_what_is_no_flight() -> None:
             build("density_head", resolve("density_head", name), target=target)
 
 
-@pytest.mark.parametrize("nonsense", [False, True])
+@pytest.mark.parametrize("nonsense", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_constants_are_found_and_of_nonsense_stay_within_their_bounds(nonsense: bool) -> None:
     frames, future, _ = simulate_windows(12)
     target = Target("real", future_names(35, STEP))
