@@ -206,9 +206,14 @@ def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> NormalisedC
     if torch.compiler.is_exporting() or not bool((counts == points).all()):
         real = point_mask(clouds, counts)[..., None]
     coordinates = clouds[..., :3].double()
-    first = coordinates[:, :1]
-    # relative to the first point: clouds far from the origin keep their digits, and equal points are exactly equal
-    offset = coordinates - first
+    # relative to a place in the cloud: clouds far from the origin keep their digits, equal points are exactly equal.
+    # "robust" takes the medians, because the first point may be an outlier, next to which the others have no digits
+    if how == "unit_ball":
+        reference = coordinates[:, :1]
+    else:
+        known = coordinates.detach() if real is None else coordinates.detach().where(real, math.nan)
+        reference = _lower_median(known)
+    offset = coordinates - reference
     if real is not None:
         offset = offset.where(real, 0)  # before anything is multiplied: NaN × 0 is not a gradient
     counted_points = real if how == "unit_ball" else near_middle(offset, real)
@@ -227,7 +232,7 @@ def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> NormalisedC
         local = local.where(real, math.nan)
     if columns > 3:
         local = torch.cat([local, clouds[..., 3:]], -1)
-    return NormalisedClouds(local, (first + mean)[:, 0], scale)
+    return NormalisedClouds(local, (reference + mean)[:, 0], scale)
 
 
 @torch.no_grad()

@@ -9,10 +9,9 @@ from scipy import integrate, special, stats
 from torch import nn
 
 from framework.configuration.schema import build, resolve
-from framework.distributions.batch_shapes import Stacked
 from framework.errors import CheckpointError, ConfigError
-from framework.model import Predictor
 from framework.target import Target
+from framework.testing.constant import ConstantPredictor
 from framework.uncertainty import own_batches
 from plugins.objective.distillation.divergence import from_teacher
 from plugins.objective.distillation.objective import Distillation, _equal
@@ -27,32 +26,6 @@ def head(name, target, **config):
 
 def objective(**config):
     return build("objective", resolve("objective", {"name": "distillation", **config}))
-
-
-class Constant(Predictor):
-    """A predictor with the same trained raw parameters for every input, which records the inputs."""
-
-    def __init__(self, density_head, raw, members=False):
-        super().__init__()
-        self.head = density_head
-        self.raw = nn.Parameter(raw)
-        self.members = members
-        self.recorded = []
-
-    def training_densities(self, inputs):
-        self.recorded.append(inputs)
-        wide = self.raw.expand(len(inputs), *self.raw.shape)
-        if self.members:
-            return Stacked([self.head(wide[:, index]) for index in range(wide.shape[1])])
-        return self.head(wide)
-
-    forward = training_densities
-
-    def loss(self, inputs, target):
-        return -self(inputs).log_prob(target)
-
-    def calibrate(self, batches):
-        raise AssertionError("an objective does not calibrate")
 
 
 def mixture_of_members(name, target, raw):
@@ -134,7 +107,7 @@ def test_the_best_student_of_an_ensemble_of_classes_is_the_mean_of_its_probabili
     torch.manual_seed(0)
     distillation = objective(teacher=CLASS_TEACHER)
     inputs = torch.randn(1, 6).expand(4, 6)
-    student = Constant(head("categorical", CLASSES), torch.zeros(3))
+    student = ConstantPredictor(head("categorical", CLASSES), torch.zeros(3))
     optimizer = torch.optim.LBFGS(student.parameters(), lr=1.0, max_iter=100, tolerance_grad=1e-9)
 
     def closure():
@@ -153,14 +126,14 @@ def test_the_best_student_of_an_ensemble_of_classes_is_the_mean_of_its_probabili
 def test_members_learn_from_the_inputs_of_one_batch():
     torch.manual_seed(0)
 
-    student = Constant(head("von_mises", ANGLE), torch.randn(2, 3), members=True)
+    student = ConstantPredictor(head("von_mises", ANGLE), torch.randn(2, 3), members=True)
     distillation = objective(teacher=ANGLE_TEACHER)
     distillation(student, {"input": torch.randn(8, 6)})
     assert student.recorded[-1].shape == (8, 6)
     ensemble = build(
         "uncertainty",
         resolve("uncertainty", {"name": "ensemble", "members": 2}),
-        model=lambda: Constant(head("von_mises", ANGLE), torch.randn(3)),
+        model=lambda: ConstantPredictor(head("von_mises", ANGLE), torch.randn(3)),
         target=ANGLE,
     )
     with own_batches(ensemble):
@@ -169,7 +142,7 @@ def test_members_learn_from_the_inputs_of_one_batch():
 
 
 def test_noise_moves_the_inputs_of_teacher_and_student_alike():
-    student = Constant(head("categorical", CLASSES), torch.zeros(3))
+    student = ConstantPredictor(head("categorical", CLASSES), torch.zeros(3))
     distillation = objective(teacher=CLASS_TEACHER, noise=0.5)
     seen = []
     distillation.teacher.register_forward_pre_hook(lambda module, arguments: seen.append(arguments[0]))
@@ -187,7 +160,7 @@ def test_the_teacher_is_neither_trained_nor_stored():
     assert not distillation.state_dict() and not list(distillation.parameters())
     distillation.train()
     assert not distillation.teacher.training
-    student = Constant(head("categorical", CLASSES), torch.zeros(3))
+    student = ConstantPredictor(head("categorical", CLASSES), torch.zeros(3))
     distillation(student, {"input": torch.randn(4, 6)}).backward()
     assert all(parameter.grad is None for parameter in distillation.teacher.parameters())
 

@@ -7,15 +7,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import special, stats
-from torch import nn
 
 from framework.configuration.schema import build, resolve
 from framework.data import Data, Splits
 from framework.datasets.fields import Fields
-from framework.distributions.batch_shapes import Stacked
 from framework.errors import ConfigError
-from framework.model import Model, Predictor
+from framework.model import Model
 from framework.target import Target
+from framework.testing.constant import ConstantPredictor
 from framework.uncertainty import own_batches
 from plugins.objective.outlier_exposure.divergence import (
     DRAWS,
@@ -39,32 +38,6 @@ def head(name, target, **config):
 
 def objective(**config):
     return build("objective", resolve("objective", {"name": "outlier_exposure", **config}))
-
-
-class ConstantPredictor(Predictor):
-    """A predictor that passes the same raw parameters to a head for every input, and records the inputs."""
-
-    def __init__(self, head, raw, members=False):
-        super().__init__()
-        self.head = head
-        self.raw = nn.Parameter(raw)
-        self.members = members
-        self.recorded = []
-
-    def training_densities(self, inputs):
-        self.recorded.append(inputs.detach().clone())
-        wide = self.raw.expand(len(inputs), *self.raw.shape)
-        if self.members:
-            return Stacked([self.head(wide[:, index]) for index in range(wide.shape[1])])
-        return self.head(wide)
-
-    forward = training_densities
-
-    def loss(self, inputs, target):
-        return -self(inputs).log_prob(target)
-
-    def calibrate(self, batches):
-        raise AssertionError("an objective does not calibrate")
 
 
 def given_batch(count=4, shape=(2,), dtype=torch.float32):
