@@ -44,10 +44,9 @@ PAGES = {
     "-m": "docs/how_to/sweeps.md",
     "--multirun": "docs/how_to/sweeps.md",
 }
-"""Page of the documentation that helps after an error of a command.
+"""Pages of the documentation that help after an error of a command, by the beginning of a word of this command.
 
-A page belongs to a command if one of the command's words begins with the key of the page. If several pages belong to
-it, the first of them in this order is named.
+If several pages fit a command, the first of them in this order is named.
 """
 FIRST_PAGE = "docs/start/by_task.md"
 """Page that helps after an error of a command to which no page in `PAGES` belongs."""

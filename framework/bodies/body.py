@@ -26,7 +26,7 @@ class Body:
     Attributes:
         source: origin of the body, for messages.
         template: the vertices of the mean shape in the rest pose.
-        faces: rows of `template`, corners counter-clockwise seen from outside.
+        faces: triangles as indices of vertices, corners counter-clockwise seen from outside.
         weights: skinning weights, ≥ 0: the share of each joint's motion that a vertex follows. The weights of a vertex
             sum to 1 (the constructor removes rounding errors of the sum).
         parents: parent of each joint, -1 for the only root.

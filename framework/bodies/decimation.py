@@ -123,7 +123,7 @@ class _Collapses:
         return {corner for face in self.around[v] for corner in self.corners[face] or ()} - {v}
 
     def _places_after(self, v: int, u: int) -> dict[int, int] | None:
-        """Return which texture coordinate of vertex u replaces each one of vertex v if v collapses onto u.
+        """Return for each texture coordinate of vertex v the one of vertex u that replaces it if v collapses onto u.
 
         The result is None if the collapse would break a seam of the texture.
         """

@@ -229,7 +229,7 @@ class ParametricBody:
 
 
 def _in_mean_pose(body: Body, traits: Traits | None, where: poses.Skeleton) -> tuple[Body, tuple[str, ...]]:
-    """Return the body with the mean pose as its rest pose and a few shape coefficients, and the coefficients' names."""
+    """Return a body whose rest pose is the mean pose, and the names of its few shape coefficients."""
     usual = [limits[0] for limits in (*poses.CENTRAL.values(), *2 * (*poses.SIDED.values(),))]
     pose = torch.from_numpy(poses.rotations(body, where, np.array([usual], float))).to(torch.float64)
     if traits is None:

@@ -191,7 +191,8 @@ def _limited(
 ) -> Float[np.ndarray, "pose"]:
     """Return random normal numbers between the limits.
 
-    A number beyond a limit is mirrored at this limit, so that no numbers accumulate there.
+    A number beyond a limit is mirrored at this limit, so that no numbers accumulate there. `wide` is a factor on the
+    standard deviation `spread` for each pose.
     """
     _, _, least, most = limits
     values = random.normal(mean, spread * wide)

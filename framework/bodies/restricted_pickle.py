@@ -212,7 +212,7 @@ def _refuse(why: str) -> NoReturn:
 class _Plain:
     """Converter of the records (`_Record`) of a pickle to arrays.
 
-    An object that is referenced twice is converted once, so that nesting cannot multiply it.
+    An object that is referenced several times is converted only once, so that the cost is bounded by the file's size.
 
     Args:
         size: size of the file, bytes, which limits the total size of the arrays.

@@ -25,7 +25,10 @@ VERSION = 1
 """Version of the cached decimations; it is increased whenever their content changes."""
 Name = Literal["7k", "14k", "27k", "110k"]
 COUNTS: dict[Name, int] = {"7k": 6_890, "27k": 27_578, "110k": 110_312}
-"""Topology → number of vertices; the first two are the thesis's (Table 7.1). "14k" is the unchanged default body."""
+"""Number of vertices of each topology, by its name; "7k" and "27k" are in the thesis (Table 7.1).
+
+The topology "14k" is missing here: it is the body itself, unchanged.
+"""
 
 
 class Corners(NamedTuple):
@@ -88,7 +91,7 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Topology:
-    """A mesh whose vertices are a subset of a sheet's vertices.
+    """A mesh whose vertices are a subset of the vertices of a `Sheet`.
 
     Attributes:
         rows: index in the sheet of each vertex of the mesh.
@@ -152,7 +155,9 @@ def topology(body: Body, surface: Sheet, name: Name) -> Topology:
 def recognise_topology(
     body: Body, vertices: int, faces: Int[np.ndarray, "faces 3"], source: str
 ) -> tuple[Sheet, Topology]:
-    """Return the topology of the body that has the vertices and triangles of a mesh, and the sheet of this topology.
+    """Return the sheet and the topology of the body that have the vertices and triangles of a mesh.
+
+    The sheet is the body's mesh with all edges split; the vertices of the topology are a subset of its vertices.
 
     Args:
         body: the body model.
@@ -278,9 +283,12 @@ def _interpolate(values: np.ndarray, stages: tuple[np.ndarray, ...]) -> np.ndarr
 
 
 def _compact(rows: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray) -> Topology:
-    """Return a topology, given its triangles and its vertices `rows`, both as indices of vertices of the sheet.
+    """Return the topology with given vertices and triangles, without texture coordinates that no triangle uses.
 
-    The topology has only those texture coordinates that its triangles use.
+    Args:
+        rows: the vertices, as indices of vertices of the sheet.
+        faces: the triangles, as indices of vertices of the sheet.
+        uv_faces: the same triangles, as indices of texture coordinates of the sheet.
     """
     place = np.zeros(max(faces.max(initial=0), rows.max(initial=0)) + 1, np.int64)
     place[rows] = np.arange(len(rows))

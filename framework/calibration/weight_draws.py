@@ -1,4 +1,4 @@
-"""Standard normal noise from which wrappers draw weights, the same noise in every call."""
+"""Standard normal noise from which wrappers draw weights; every call returns the same noise."""
 
 import numpy as np
 import torch

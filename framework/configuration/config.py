@@ -36,7 +36,7 @@ class Config:
             agree with the stored ones.
         folder: Folder of the run.
         overrides: Overrides on the command line.
-        trained_on: Data set on which the stored model of the command was trained; empty if there is no such model.
+        trained_on: Name of the data set on which the stored model of the command was trained; "" without such a model.
     """
 
     settings: Settings

@@ -121,7 +121,10 @@ _CONDITIONS = (
         for key in ("preset", "debug")
     ),
 )
-"""Conditions on the composed config; code that detects an idle setting only later calls `runs.job.refuse_idle`."""
+"""Conditions on the composed config that this module checks.
+
+Settings whose lack of effect cannot be seen from the config are refused later, by `runs.job.refuse_idle`.
+"""
 
 
 def require_read(mode: str, overrides: Sequence[str]) -> None:

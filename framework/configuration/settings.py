@@ -243,7 +243,10 @@ class GradientAccumulationSettings(_Strict):
     """Numbers of batches whose gradients are averaged for one optimiser step, by epoch."""
 
     batches: Annotated[dict[NotNegative, Count], Field(min_length=1)]
-    """Number of batches of a step from an epoch on, by the epoch, from 0; before the first one a step has one batch."""
+    """Number of batches of an optimiser step, by the epoch (from 0) from which on it holds.
+
+    Before the first of these epochs a step has one batch.
+    """
 
 
 class ModelSummarySettings(_Strict):
@@ -411,7 +414,7 @@ class Settings(_Strict):
         return settings
 
     def plain(self) -> dict[str, Any]:
-        """Return the keys that the composed config sets, as plain values, which the run folder stores."""
+        """Return the settings that the composed config contains, as the plain values that the run folder stores."""
         return self.model_dump(exclude_unset=True)
 
     @property
@@ -441,7 +444,7 @@ def store_experiment(config: Mapping[str, Any], trained_on: str = "") -> str:
 
     Args:
         config: Composed config of the run.
-        trained_on: Data set on which the stored model of the command was trained; "" if there is no such model.
+        trained_on: Name of the data set on which the stored model of the command was trained; "" without such a model.
     """
     logger = config.get("logger") or {}
     name = config.get("experiment_name")

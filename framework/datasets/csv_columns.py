@@ -594,7 +594,7 @@ def numbers(
 
 
 def _hint(cell: str, value: float | None, columns: Columns, missing: str | None) -> str:
-    """Return a further remedy, with a leading space, for a cell without a finite number; "" if no other is known."""
+    """Return a further remedy, with a leading space, for a cell without a finite number; "" if none is known."""
     if value is not None:
         return f" Or {missing}." if math.isnan(value) and missing else ""
     mend = _other_reading(cell, columns.notation)

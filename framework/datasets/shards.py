@@ -87,7 +87,10 @@ class Shards:
             return torch.from_numpy(array)
 
     def batches(self, number: int, batch_size: int) -> Iterator[Tensor]:
-        """Yield the inputs of shard `number` in batches, each without last rows that are padding in all its clouds."""
+        """Yield the inputs of shard `number` in batches.
+
+        If all clouds of a batch end with rows of padding, the rows that are padding in every cloud are removed.
+        """
         for batch in self.read(number).split(batch_size):
             yield trim(batch)
 

@@ -60,9 +60,12 @@ SCRIPTS = ("predict", "serve")
 PACKAGE = exported_folder.__name__
 """Package with the scripts that are copied into an exported folder."""
 EXTREMES = {"random": 1.0, "extreme": 1e4}
-"""Factors of the spread of the arrays on which the exported model is compared with the original one."""
+"""Factors on the usual standard deviation of the arrays on which the exported and the original model are compared."""
 BATCH, FEWER = 16, 5
-"""Numbers of inputs with which a model is tried."""
+"""Number of inputs in a batch with which a model is tried, and in a second batch.
+
+From the difference between both batches, `_noises` finds how many random numbers the model draws for each input.
+"""
 RANDOM = "It draws random numbers by other functions than torch.rand, torch.randn and dropout layers."
 VARYING = "How many random numbers it draws depends on its inputs."
 MOST_NOISE = 2**22
@@ -134,7 +137,7 @@ class Exporting:
         """Return `count` random arrays that the model accepts; `spread` is a factor on their usual standard deviation.
 
         An encoder may refuse random point clouds, because some of their points are not in the unit ball. Every point is
-        then moved to one of the eight corners of a cube in this ball, so that many points coincide.
+        then moved to one of the eight corners of a cube in this ball. Many points of such a cloud coincide.
         """
         arrays = self.arrays(count, spread, seed=count)
         if self.cloud:
@@ -349,7 +352,14 @@ def _form(model: Exporting) -> tuple[Exported, list[ModelNoise]]:
 
 
 def _noises(model: Exporting, arrays: Tensor) -> list[ModelNoise]:
-    """Return the random numbers that a model draws, from the draws for two batches of different sizes."""
+    """Return a description of each array of random numbers that a model draws, in the order of the draws.
+
+    The model is called with two batches of different sizes. A length that differs between them is a multiple of the
+    batch size.
+
+    Raises:
+        ConfigError: the number of random numbers depends on the inputs in another way, or is above MOST_NOISE.
+    """
     noises_by_batch = []
     for part in (arrays, arrays[:FEWER]):
         with torch.no_grad(), given_draws() as noises:

@@ -77,7 +77,8 @@ class Frozen:
 
     Args:
         predictor: the trained predictor; a copy of it is used.
-        input_shape: shape of one input; None if it is read from the first call, or from a `FrozenFrontEnd`.
+        input_shape: shape of one input; None: it is read from the fixed encoders before the predictor
+            (`FrozenFrontEnd`) or, without these, from the first call.
         data: data set that converts raw input; None if inputs are those of the predictor.
 
     Attributes:

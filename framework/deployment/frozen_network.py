@@ -223,9 +223,9 @@ class UnreadableGraph(Exception):
 
 
 class Signal(NamedTuple):
-    """Value of a node of a model's graph as scale * (content of the register) + shift, element by element.
+    """Value of a node of a model's graph: scale * (content of register number `register`) + shift, element by element.
 
-    None stands for a scale of 1 and a shift of 0.
+    A scale of None stands for 1, and a shift of None for 0.
     """
 
     register: int

@@ -1,4 +1,4 @@
-"""`framework.load`: a trained model for Python, on request with the setting of its knobs that meets a budget."""
+"""Loading of a trained model in Python (`framework.load`); with a budget, its knobs are set such that it meets it."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace

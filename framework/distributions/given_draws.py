@@ -102,7 +102,10 @@ def given_draws(arrays: Sequence[Tensor | None] | None = None) -> Iterator[list[
 
 
 def draws_are_given() -> bool:
-    """Return whether the caller is inside of `given_draws`, where random numbers are drawn for the whole batch."""
+    """Return whether the caller is inside of a `given_draws` block.
+
+    There, code that draws random numbers separately for parts of a batch must draw them for the whole batch at once.
+    """
     return _active
 
 

@@ -26,7 +26,7 @@ REACH = 64
 BLOCK = 7
 """Number of binary digits of a node's index within its block; memory is reserved for whole blocks of nodes."""
 COARSEST = 8
-"""Level of 2⁸ nodes on a circle, on which wide components are computed at all nodes."""
+"""Coarsest level of a circle, with 2⁸ nodes; components of this level are wide, and are computed at all these nodes."""
 FINEST = 2.0**36
 """Largest index of a node; at larger indices, rounding would shift the positions of nodes relative to components."""
 AT_ONCE = 2**13
@@ -128,7 +128,7 @@ class _Grid:
 
     @classmethod
     def around(cls, level: Tensor, node: Tensor, circle: bool) -> "_Grid":
-        """Return an empty grid with memory for all nodes whose number differs by at most REACH from one in `node`."""
+        """Return an empty grid with memory for each node whose number differs by at most REACH from one of `node`."""
         steps = torch.tensor([[-REACH], [0], [REACH]], device=node.device)
         keys = cls.key(level, node + steps, circle).unique()
         if circle:

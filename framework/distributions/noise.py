@@ -41,8 +41,8 @@ def seed_step(seed: int, step: int, stage: str, rank: int = 0) -> None:
 
     Args:
         seed: seed of the run.
-        step: number of the batch. The number of the optimiser's step would give batches whose gradients are
-            accumulated the same noise.
+        step: number of the batch. It is not the number of the optimiser's step, because all batches whose gradients
+            are accumulated for one step would then have the same noise.
         stage: name of what the noise is used for, such as "train" or "validation".
         rank: number of the process, if several processes train one model; 0 for a single process.
     """

@@ -38,9 +38,10 @@ If the difference is larger, the grid does not resolve the power.
 MASS_GAP = 0.01
 """Largest accepted |log ∫ p| on a grid, nats; if it is larger, a peak of p lies between the grid's angles."""
 HELD = 0.3
-"""Probability that a single angle of the grid represents, above which MASS_GAP does not apply.
+"""Probability of the arc of a single angle of the grid, above which MASS_GAP does not apply.
 
-The angle then lies on the peak. The grid is too coarse for p itself, but not necessarily for its power.
+Such an angle lies on the peak of p, so that the grid does not miss the peak. The grid is then too coarse for p itself,
+but not necessarily for its power.
 """
 NARROWEST = 3.0
 """Stretch s of the densest grid, in standard deviations of the power at its mode.
@@ -133,12 +134,14 @@ def divide_by_temperature(log_density: Tensor, temperature: Tensor) -> Tensor:
 
 
 class RescaledClasses(CategoricalDensity):
-    """A density over classes whose log-probabilities are `slope` times those of another density, plus a constant.
+    """A density over classes with the logits a log p_k + b_k, for the probabilities p_k of another density.
+
+    The slope a is a number, 1/T for a temperature T. The biases b_k of the classes are constants, 0 for a temperature.
 
     Args:
         logits: log-probabilities of this density, up to a constant per item of the batch, (*batch, label).
         density: the other density, whose Monte Carlo error gives the error of this density.
-        slope: a scalar, 1/T for a temperature T.
+        slope: a, a scalar.
     """
 
     def __init__(self, logits: Float[Tensor, "*batch label"], density: Distribution, slope: Tensor) -> None:
@@ -151,10 +154,10 @@ class RescaledClasses(CategoricalDensity):
 def _(density: RescaledClasses, value: Tensor) -> Estimate:
     """Return the log-probability of the classes `value`, with an upper bound of its Monte Carlo error.
 
-    Let p_k be the probabilities of the other density, s_k the standard errors of their logarithms, a the `slope` and
-    q_k the probabilities of this density, log q_k = a log p_k - log Σ_j p_j^a + constants. Errors e_j of log p_j cause
-    the error a (e_k - Σ_j q_j e_j) of log q_k. The errors may be correlated in any way, so the bound is a ((1 - q_k)
-    s_k + Σ_{j≠k} q_j s_j).
+    Let p_k be the probabilities of the other density, s_k the standard errors of their logarithms, and q_k the
+    probabilities of this density: log q_k = a log p_k + b_k - log Σ_j exp(a log p_j + b_j) with the slope a and the
+    biases b_k. Errors e_j of log p_j cause the error a (e_k - Σ_j q_j e_j) of log q_k. The errors may be correlated in
+    any way, so the bound is a ((1 - q_k) s_k + Σ_{j≠k} q_j s_j).
     """
     log_prob = density.log_prob(value)
     with torch.no_grad():
@@ -220,7 +223,7 @@ class CircularPower(DerivedDensity):
     def _fill(self) -> Float[Tensor, "*batch"]:
         """Evaluate the power p^(1/T) and its normaliser Z on the grid.
 
-        Return the error of log Z, nats; it is infinite where the grid misses a peak.
+        Return the error of log Z, nats; it is infinite where the grid misses a peak, unless it is the finest grid.
         """
         self.angles, log_width = self._grid(self.points)
         log_prob = self.density.log_prob(self.angles)  # (points, *batch)

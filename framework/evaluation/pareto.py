@@ -19,11 +19,11 @@ def front(
 
     A point beats another if it is significantly better in one of the two quantities, and not significantly worse in the
     other. Errors differ significantly if their difference exceeds `least_significant`; run times differ significantly
-    if their relative difference exceeds `time_noise`. The front is the only set of points with two properties: none of
-    its points beats another of them, and each point outside is beaten by one of them. So two equal points are both on
-    the front, and so is a point that is beaten only by points outside the front. If points beat each other in a ring,
-    because their errors have unequal uncertainty, the fastest of them is on the front. Points that are not finite are
-    not on the front.
+    if their relative difference exceeds `time_noise`. The front is the set of points with two properties: none of its
+    points beats another of them, and each point outside is beaten by one of them. So two equal points are both on the
+    front, and so is a point that is beaten only by points outside the front. Errors with unequal uncertainty can make
+    points beat each other in a ring, so that no such set exists; the fastest point of the ring is then on the front.
+    Points that are not finite are not on the front.
 
     Errors on the same samples are positively correlated. The comparison ignores this, so it calls fewer differences
     significant than there are.

@@ -150,7 +150,7 @@ def evaluate_frames(
 
     Args:
         painter: renderer and background; its channels include those that the metrics read.
-        blocks: groups of frames; the frames of a group are drawn together.
+        blocks: all frames, in blocks; the frames of a block are drawn together.
         metrics: metrics to compute; they are copied.
         groups: names of the groups of frames; the field "group" of a frame's `truth` holds indices of these names.
         keep: function that is called with each frame and its channels, for example to write them to a file.
@@ -178,7 +178,7 @@ def frame_cost(painter: Painter, frames: Sequence[Frame]) -> Cost:
     """Return the cost per frame of drawing `frames` together, and the run time of drawing one frame alone.
 
     A renderer may reuse results that have not changed since the last image. Therefore no two consecutive images are the
-    same: the frames are drawn in turn. A single frame alternates with one whose image is shifted by a pixel.
+    same: the frames are drawn in turn, and a single frame alternates with a copy whose image is shifted by a pixel.
 
     Args:
         painter: renderer and channels.

@@ -22,8 +22,8 @@ Vector = tuple[Any, Any, Any]
 class Constants:
     """Constants of a table-tennis ball and a table.
 
-    The values are those of the simulator of the WAM laboratory, which also published recorded flights, for all
-    constants that this simulator has.
+    If the simulator of the WAM laboratory has a constant, its default here is the simulator's value. This laboratory
+    also published recorded flights.
 
     Attributes:
         gravity: acceleration of gravity, m/s².

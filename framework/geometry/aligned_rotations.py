@@ -333,7 +333,8 @@ def _coefficients(terms: int = 20) -> dict[str, list[float]]:
 class _LogProb(Function):
     """Autograd function of the log-density.
 
-    The derivative with respect to F is R - E R. Of the terms, only -Σ λᵢqᵢ² depends on the quaternion.
+    Its derivative with respect to F is R - E R. The only term of the log-density that depends on the quaternion is
+    -Σ λᵢqᵢ².
     """
 
     @staticmethod

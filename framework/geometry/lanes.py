@@ -272,14 +272,20 @@ def highest(typing, vector):
 @intrinsic
 @no_type_check
 def total(typing, vector):
-    """Return the sum of all lanes."""
+    """Return the sum of all lanes.
+
+    Call it as `total(vector)`; numba passes `typing`.
+    """
     return folded(vector, arithmetic("fadd", "add"))
 
 
 @intrinsic
 @no_type_check
 def bits(typing, truth):
-    """Return an int64 whose bit i is lane i of a vector of truth values."""
+    """Return an int64 whose bit i is lane i of a vector of truth values.
+
+    Call it as `bits(truth)`; numba passes `typing`.
+    """
 
     def make(builder, value):
         return builder.zext(builder.bitcast(value, ir.IntType(truth.count)), ir.IntType(64))
@@ -290,7 +296,10 @@ def bits(typing, truth):
 @intrinsic
 @no_type_check
 def mask(typing, number):
-    """Return the 16 lowest bits of an int64 as a vector of truth values."""
+    """Return the 16 lowest bits of an int64 as a vector of truth values.
+
+    Call it as `mask(number)`; numba passes `typing`.
+    """
 
     def make(builder, value):
         return builder.bitcast(builder.trunc(value, ir.IntType(LANES)), ir.VectorType(ir.IntType(1), LANES))
@@ -301,21 +310,30 @@ def mask(typing, number):
 @intrinsic
 @no_type_check
 def first(typing, number):
-    """Return the index of the lowest set bit of an int64 that is not 0."""
+    """Return the index of the lowest set bit of an int64 that is not 0.
+
+    Call it as `first(number)`; numba passes `typing`.
+    """
     return coded(types.int64, (number,), lambda builder, x: builder.cttz(x, ir.Constant(ir.IntType(1), 1)))
 
 
 @intrinsic
 @no_type_check
 def how_many(typing, number):
-    """Return the number of bits of an int64 that are set."""
+    """Return the number of bits of an int64 that are set.
+
+    Call it as `how_many(number)`; numba passes `typing`.
+    """
     return coded(types.int64, (number,), lambda builder, x: builder.ctpop(x))
 
 
 @intrinsic
 @no_type_check
 def whole(typing, vector):
-    """Return the numbers of a vector rounded towards zero, as int32; they must be in the range of int32."""
+    """Return the numbers of a vector rounded towards zero, as int32; they must be in the range of int32.
+
+    Call it as `whole(vector)`; numba passes `typing`.
+    """
     result = Lanes(types.int32, vector.count)
     return coded(result, (vector,), lambda builder, x: builder.fptosi(x, ir.VectorType(INT32, vector.count)))
 
@@ -323,7 +341,10 @@ def whole(typing, vector):
 @intrinsic
 @no_type_check
 def lane(typing, vector, index):
-    """Return the number in the lane `index` of a vector."""
+    """Return the number in the lane `index` of a vector.
+
+    Call it as `lane(vector, index)`; numba passes `typing`.
+    """
     return coded(vector.element, (vector, types.intp), lambda builder, x, i: builder.extract_element(x, i))
 
 
@@ -333,6 +354,8 @@ def with_id(typing, vector, number):
     """Return `vector`, of four lanes, with the bits of an integer in its last lane.
 
     The integer is stored as int32 in a float32 vector, and as int64 in a float64 vector.
+
+    Call it as `with_id(vector, number)`; numba passes `typing`.
     """
     width = vector.element.bitwidth
 
@@ -363,7 +386,10 @@ def pointer(context, builder, sig, values):
 @intrinsic
 @no_type_check
 def take(typing, array, index):
-    """Return the element of an array at `index`, which must not be negative."""
+    """Return the element of an array at `index`, which must not be negative.
+
+    Call it as `take(array, index)`; numba passes `typing`.
+    """
 
     def generate(context, builder, sig, values):
         return builder.load(pointer(context, builder, sig, values))
@@ -405,14 +431,20 @@ def loaded(array, stride, parts, count=LANES):
 @intrinsic
 @no_type_check
 def load(typing, array, start):
-    """Return a vector of 16 consecutive elements of an array, from index `start` on."""
+    """Return a vector of 16 consecutive elements of an array, from index `start` on.
+
+    Call it as `load(array, start)`; numba passes `typing`.
+    """
     return loaded(array, 1, 1)
 
 
 @intrinsic
 @no_type_check
 def gather(typing, array, indices, truth):
-    """Return the elements of an array at the int64 `indices` in lanes where `truth` is true, and 0 in other lanes."""
+    """Return the elements of an array at the int64 `indices` in lanes where `truth` is true, and 0 in other lanes.
+
+    Call it as `gather(array, indices, truth)`; numba passes `typing`.
+    """
     result = Lanes(array.dtype)
 
     def generate(context, builder, sig, values):
@@ -438,28 +470,40 @@ def gather(typing, array, indices, truth):
 @intrinsic
 @no_type_check
 def load4(typing, array, start):
-    """Return a vector of 4 consecutive elements of an array, from index `start` on."""
+    """Return a vector of 4 consecutive elements of an array, from index `start` on.
+
+    Call it as `load4(array, start)`; numba passes `typing`.
+    """
     return loaded(array, 1, 1, 4)
 
 
 @intrinsic
 @no_type_check
 def load_triples(typing, array, start):
-    """Return vectors x, y, z of 16 points that are stored as x y z x y z … from index `start` on."""
+    """Return vectors x, y, z of 16 points that are stored as x y z x y z … from index `start` on.
+
+    Call it as `load_triples(array, start)`; numba passes `typing`.
+    """
     return loaded(array, 3, 3)
 
 
 @intrinsic
 @no_type_check
 def load_quadruples(typing, array, start):
-    """Return four vectors x, y, z, w of 16 records that are stored as x y z w x y z w … from index `start` on."""
+    """Return four vectors x, y, z, w of 16 records that are stored as x y z w x y z w … from index `start` on.
+
+    Call it as `load_quadruples(array, start)`; numba passes `typing`.
+    """
     return loaded(array, 4, 4)
 
 
 @intrinsic
 @no_type_check
 def store(typing, array, start, vector):
-    """Write a vector to consecutive elements of an array, from index `start` on."""
+    """Write a vector to consecutive elements of an array, from index `start` on.
+
+    Call it as `store(array, start, vector)`; numba passes `typing`.
+    """
 
     def generate(context, builder, sig, values):
         address = pointer(context, builder, sig, values)

@@ -66,7 +66,8 @@ def text_lines(content: bytes, comment: bytes | None = b"#", names: Sequence[byt
         content: bytes of the file.
         comment: sign at which a comment begins, unless it stands within a number such as 1.#INF; None if there are no
             comments.
-        names: first words of lines that are kept whole, because the name after the first word may contain `comment`.
+        names: first words of lines in which the comment sign is an ordinary character, because a name in them may
+            contain it.
 
     Raises:
         ValueError: the text is UTF-16.
@@ -287,7 +288,7 @@ def join_continued_lines(content: bytes) -> bytes:
 def statements(content: bytes, names: Sequence[bytes] = ()) -> Iterator[tuple[bytes, bytes]]:
     """Yield the first word and the rest of each line of an OBJ or MTL file, without comments.
 
-    Lines whose first word is in `names` are kept whole.
+    In lines whose first word is in `names`, the comment sign is an ordinary character.
     """
     for line in text_lines(content, names=names):
         key, *rest = line.split(None, 1)

@@ -256,7 +256,7 @@ def _locate_lists(
 ) -> tuple[Int[np.ndarray, "items"], Int[np.ndarray, "places"]]:
     """Return the lengths and the positions of the lists that the items of an element store for one property.
 
-    The position at which the data of the element end is appended to the positions.
+    The positions have one further entry: the position at which the data of the element end.
 
     Args:
         body: bytes after the header.

@@ -16,7 +16,10 @@ Point = Sequence[Number]
 Points = Sequence[Any] | np.ndarray
 """Point (3,), or a list of points (points, 3), or a list of such lists."""
 Edges = Literal["shared", "rims", "sharp"]
-"""Edges of a `loft` that are creases: none ("shared": facets share their vertices), the rims of its caps, or all."""
+"""Edges of a `loft` at which the shading has a crease.
+
+"shared": none, since facets share their vertices; "rims": the rims of the caps; "sharp": all.
+"""
 
 _SQUARE = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2
 

@@ -25,7 +25,10 @@ def inlined(function: Callable[..., Any]) -> Any:
 @intrinsic
 @no_type_check
 def fetch_and_add(typing, counter, number):
-    """Return counter[0], an int64, and add `number` to it atomically, so that several threads get different values."""
+    """Return counter[0], an int64, and add `number` to it atomically, so that several threads get different values.
+
+    Call it as `fetch_and_add(counter, number)`; numba passes `typing`.
+    """
 
     def generate(context, builder, sig, values):
         array = context.make_array(sig.args[0])(context, builder, values[0])
