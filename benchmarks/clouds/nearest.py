@@ -103,7 +103,7 @@ def samplers() -> dict[str, Callable[[int, np.random.Generator], Array]]:
 
 
 def clouds(points: int, count: int) -> list[Array]:
-    """Return clouds in the unit ball (eq. 6.2); one after the other, they have the shapes of `samplers`.
+    """Return clouds in the unit ball (eq. 6.2), whose shapes are those of `samplers` in turn.
 
     All clouds differ, so that the processor cannot learn the branches of one cloud.
     """
@@ -119,7 +119,7 @@ def clouds(points: int, count: int) -> list[Array]:
 # Each of the following methods gets a cloud (n, 3) and basis points (k, 3), and returns distances (k,) and difference
 # vectors (k, 3).
 def ball_tree(cloud: Array, basis: Array) -> tuple[Array, Array]:
-    """Search as the package of the paper does, re-created from its description."""
+    """Search by the ball tree of the paper's package, re-created from its description."""
     tree = NearestNeighbors(n_neighbors=1, leaf_size=1, algorithm="ball_tree").fit(cloud)
     distance, index = tree.kneighbors(basis)
     return distance[:, 0], cloud[index[:, 0]] - basis

@@ -87,7 +87,7 @@ def load_labelled(split, count: int, vertex_part: Tensor) -> tuple[Tensor, Tenso
 
 
 def network_inputs(clouds: Tensor, basis_points: Basis, points: Tensor, whole: bool) -> Tensor:
-    """Return what the network reads for some points (scan, point, 3) of clouds; `whole`: also the cloud's encoding."""
+    """Return the network's inputs for `points` (scan, point, 3): coordinates and, if `whole`, the cloud's encoding."""
     return per_point(encode(clouds, basis_points, ["distance"], "none"), points) if whole else points
 
 

@@ -66,7 +66,7 @@ def read_runs(sweeps: Sequence[Path]) -> dict[str, list[Run]]:
 def over_seeds(runs: Sequence[Run], key: str) -> tuple[float, float]:
     """Return the mean of a metric over seeds and its standard error for new test clouds and new seeds.
 
-    All seeds have the same test clouds, so that the variance for the choice of clouds is not divided by their number.
+    All seeds have the same test clouds, so the variance that the choice of clouds causes does not fall with more seeds.
     """
     values = [run.results[key] for run in runs]
     clouds = float(np.mean([run.results[f"{key}_sem"] ** 2 for run in runs]))

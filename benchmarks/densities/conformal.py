@@ -91,7 +91,7 @@ def scaled_von_mises(factor: float) -> Callable[[Tensor], Distribution]:
 def wrap(
     predict: Callable[[Tensor], Distribution], target: Target, score: str, miscoverage: float, tempered: bool
 ) -> Predictor:
-    """Return a fixed predictor in the conformal wrapper; `tempered`: with a temperature wrapper between them."""
+    """Return a fixed predictor in the conformal wrapper, with a temperature wrapper between both if `tempered`."""
 
     def model() -> Predictor:
         return Fixed(predict)
@@ -112,7 +112,7 @@ def measure(
     miscoverage: float,
     tempered: bool,
 ) -> tuple[float, float, float, float]:
-    """Return coverage, its standard deviation over splits, mean size, and the coverage without calibration."""
+    """Return coverage of the sets, its standard deviation over splits, their mean size, and uncalibrated coverage."""
     generator = torch.Generator().manual_seed(0)
     covered, sizes = [], []
     for _ in range(SPLITS):

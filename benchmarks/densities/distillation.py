@@ -170,7 +170,7 @@ def spread(values: Sequence[float]) -> str:
 
 
 def main() -> None:
-    """Run the command of the command line."""
+    """Run the step that the command line names."""
     parser = argparse.ArgumentParser(description="Compare one network, an ensemble and distilled students.")
     parser.add_argument("step", choices=("train", "page"))
     parser.add_argument("root", type=Path, nargs="?", help="folder of the UCI tables")

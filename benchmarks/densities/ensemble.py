@@ -110,7 +110,7 @@ def seconds(call: Callable[[], object]) -> float:
 def time_loops(
     data: Data, fields: dict[str, Tensor], width: int
 ) -> dict[str, tuple[float, float, list[float]]]:
-    """Return for each loop the median seconds together and separately, and the speed-up of each round."""
+    """Return for each loop the median seconds of training together and one by one, and each round's speed-up."""
 
     def train_separately(train: Callable[[Predictor], None]) -> None:
         for seed in range(MEMBERS):

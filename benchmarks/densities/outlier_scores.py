@@ -242,7 +242,7 @@ def spread(values: Sequence[float]) -> str:
 
 
 def main() -> None:
-    """Run the command of the command line."""
+    """Run the step that the command line names."""
     parser = argparse.ArgumentParser(description="Compare scores that recognise outliers.")
     parser.add_argument("step", choices=("measure", "page"))
     parser.add_argument("set", choices=("moons", "digits"), nargs="?")

@@ -79,7 +79,7 @@ class Model:
 
     @torch.no_grad()
     def predict(self, setting: tuple[int, ...]) -> None:
-        """Compute a density, its point prediction, and the measure, of a batch."""
+        """Compute the densities, the point predictions and the error of a batch."""
         self.knobs.set(setting)
         prediction = Prediction(self.predictor(self.batch["input"]), self.batch, self.samples)
         _ = prediction.point
@@ -87,7 +87,7 @@ class Model:
         metric.update(prediction)  # type: ignore[operator]
 
     def error(self, setting: tuple[int, ...], split: str) -> float:
-        """Return the measure on a split, with random numbers that the choice of a setting did not use."""
+        """Return the error on a split, with random numbers that the choice of a setting did not use."""
         self.knobs.set(setting)
         samples = getattr(self.data.splits(), split)
         count = min(SAMPLES, len(samples))

@@ -6,7 +6,7 @@ The planted faults are in tests/planted_faults.py and tests/planted_questions.py
 of all density heads of this project and over the correct density heads of tests/right_heads.py, with several random
 seeds. The results are written to check.md beside this file. With `more` the script continues after the last seed of
 that file, which is valid only if the code has not changed. If names are given, only these density heads are tested, and
-only the section about a later run of the page is written.
+only the page's last section is written, which is about such later runs.
 """
 
 import re

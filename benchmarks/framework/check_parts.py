@@ -5,8 +5,8 @@
 GROUP is data, metric, encoder, renderer, uncertainty or objective. The planted faults are in tests/planted_*.py. False
 alarms are counted over the rows of all plugins of the group and over correct plugins that are not part of this project
 (RIGHT in tests/planted_*.py), with several random seeds. The results are written to check_<group>.md beside this file
-after each seed. If names are given, only these plugins are tested, and only the section about a later run of the page
-is written, which says the machine and the date of that run.
+after each seed. If names are given, only these plugins are tested, and only the page's last section is written. It is
+about such a later run, and says its machine and date.
 """
 
 import statistics
@@ -41,7 +41,7 @@ from tests import (
 
 Examine = Callable[[], Iterator[Finding]]
 LATER_RUN = "## Plugins tested in a later run"
-"""Heading of the section about the plugins that the run of the whole page did not test, or that changed after it."""
+"""Heading of the section about plugins that were added or changed after the run of the whole page."""
 
 
 def planted_faults(group: str) -> dict[str, Examine]:
@@ -227,7 +227,7 @@ def write_later_run(page: Path, group: str, names: list[str], seeds: int, comman
         group: Name of the group.
         names: Names of the plugins.
         seeds: Number of random seeds.
-        command: Command that runs this.
+        command: Command that ran this script, for the page.
     """
     if LATER_RUN not in page.read_text(encoding="utf-8").splitlines():
         page.write_text(page.read_text(encoding="utf-8") + f"\n{LATER_RUN}\n", encoding="utf-8")

@@ -93,7 +93,7 @@ def command(folder: Path, into: Path, *words: str, several: bool = True) -> list
 
 
 def rate_between_parts(into: Path, jobs: int) -> float:
-    """Return the clouds per second of all jobs together between the first and the last part of each."""
+    """Return the clouds per second of all jobs together, each timed from its first to its last written part."""
     times = [path.stat().st_mtime for path in sorted(into.glob("part-*.npy"))]
     shares = [times[job::jobs] for job in range(jobs)]
     return sum(PART * (len(share) - 1) / (max(share) - min(share)) for share in shares)

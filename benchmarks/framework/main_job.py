@@ -113,7 +113,7 @@ def run_job(tree: Path, seed: int, precision: str, epochs: int) -> dict[str, Any
 
 
 def part_ends(lines: Sequence[dict[str, Any]]) -> list[float]:
-    """Return the times, seconds since 1970, at which all parts but the last end, from the lines of a journal."""
+    """Return the end of each part of the job except the last, seconds since 1970, from the lines of a journal."""
 
     def times(fits: Callable[[dict[str, Any]], bool]) -> list[float]:
         return [line["time"] for line in lines if fits(line)]

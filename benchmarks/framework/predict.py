@@ -53,7 +53,7 @@ with torch.no_grad():
     for first in range(0, len(rows), 64):
         model(rows[first : first + 64]).mode
 """
-"""Script that the rows are compared with: it predicts the same batches, and neither computes more nor writes."""
+"""Script with which the rows are compared: it only predicts the same batches, and writes no file."""
 LOAD = "import framework; framework.load('reals', paths={'data.path': 'train.csv'})"
 CLOUD = ("data=point_cloud_folder", "mode.files=clouds", "mode.into=features")
 START = {

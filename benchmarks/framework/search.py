@@ -129,7 +129,7 @@ def front_of(trials: Points) -> Points:
 
 
 def beaten(some: Points, others: Points) -> int:
-    """Return how many of some points another point beats: better in one quantity, not worse in the other."""
+    """Return how many points of `some` a point of `others` beats: better in one quantity, not worse in the other."""
     return sum(
         any(
             (error <= own_error and time * (1 + TIME_NOISE) < own_time)

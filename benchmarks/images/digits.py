@@ -35,9 +35,12 @@ SEEDS = (0, 1, 2)
 NODES = 360
 """Number of angles at which a density is evaluated."""
 NEAR = math.pi / 4
-"""Largest distance from a reading at which mass is counted as that reading's, radians."""
+"""Largest distance from the angle of a reading at which probability counts as that of the reading, radians.
+
+A turned 6 can also be read as a 9, and the reverse. The two readings are the true angle and the opposite angle.
+"""
 READING, LEAST_GAIN = 0.1, 0.3
-"""Mass that both readings of a turned 6 or 9 shall hold, and the gain over `von_mises` in nats."""
+"""Probability that each reading of a turned 6 or 9 shall have, and aim of the gain over `von_mises`, nats."""
 SWEEPS = ROOT / "outputs" / "sweeps"
 IMAGES = ("data.image_size=32", "data.grayscale=true", "threads=1", "logger=none")
 
@@ -119,7 +122,7 @@ def densities_on_circle(run: Path, inputs: Tensor) -> tuple[np.ndarray, np.ndarr
 
 
 def reading_masses(angles: np.ndarray, density: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return the mass within NEAR of the true angle and of its opposite, (image, 2)."""
+    """Return the probability within NEAR of the true angle and of the opposite angle, (image, 2)."""
     offset = angles - target[:, None]
     masses = []
     for reading in (0.0, math.pi):
@@ -159,7 +162,7 @@ def likelihood_table() -> tuple[list[str], str]:
 
 
 def reading_table() -> tuple[list[str], str]:
-    """Return the table of the masses of the two readings of a turned 6 or 9, and a sentence about the aim."""
+    """Return the table of the probabilities of both readings of a turned 6 or 9, and a sentence about the aim."""
     lines = [
         f"| density head | mass at the true reading | mass at the other reading | images where both hold {READING} |",
         "|---|---:|---:|---:|",
@@ -190,7 +193,7 @@ def reading_table() -> tuple[list[str], str]:
 
 
 def corruption_rows() -> list[dict[str, Any]]:
-    """Return one row for each corruption and strength, and first the row of the clean images (strength 0)."""
+    """Return one row for each corruption and strength; strength 0 stands for the clean images."""
     clean = json.loads((_folder("classes") / "results.json").read_text(encoding="utf-8"))
     rows = [{"corruption": kind, "strength": 0, **_scores(clean)} for kind in CORRUPTIONS]
     for file in sorted(_folder("corrupted").glob("*/results.json")):

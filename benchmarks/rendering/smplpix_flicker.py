@@ -44,7 +44,7 @@ Images = dict[str, list[Tensor]]
 
 
 def walk(run: str, file: Path, subject: str) -> tuple[Images, list[Scene]]:
-    """Return the images of a walking subject by way to draw them, values 0 to 255, and the scenes that they show."""
+    """Return the images of a walking subject, 0 to 255, for each way to draw them, and the scenes that they show."""
     description, _ = read_stored(run)
     data = training_data(description, "human_scans")
     height, width = description.target.size
@@ -71,8 +71,8 @@ def differences(images: Images, scenes: list[Scene]) -> tuple[dict[str, list[Ten
     """Compare each image with the next one.
 
     Returns:
-        Differences by way to draw, (height, width) for each pair, NaN at pixels whose point is not visible in both
-        images; and the masks of the other pixels.
+        For each way to draw, the difference of each pair of images, (height, width), which is NaN at pixels whose point
+        is not visible in both images; and for each pair the mask of the other pixels.
     """
     renderer = build_renderer("rasterizer")
     rendered_channels = [renderer(scene, flow.CHANNELS) for scene in scenes]
@@ -91,7 +91,7 @@ def differences(images: Images, scenes: list[Scene]) -> tuple[dict[str, list[Ten
 
 
 def summarise(per_subject: list[dict[str, list[Tensor]]]) -> dict[str, dict[str, float]]:
-    """Return for each way to draw the mean, the 95th percentile, and the mean's standard deviation over subjects."""
+    """Return mean, 95th percentile and the mean's standard deviation over subjects, for each way to draw."""
     rows = {}
     for name in per_subject[0]:
         by_subject = [
@@ -107,7 +107,7 @@ def summarise(per_subject: list[dict[str, list[Tensor]]]) -> dict[str, dict[str,
 
 
 def draw_figure(images: Images, changes: dict[str, list[Tensor]]) -> Figure:
-    """Return the figure of one image of each way, and of its difference to the next image."""
+    """Return the figure of image SHOWN for each way to draw, and of its difference from the image before it."""
     figure = titled_figure((9.5, 6.5), "A walk, and how much of each image flickers", True)
     axes = figure.subplots(2, len(images))
     for column, name in enumerate(images):

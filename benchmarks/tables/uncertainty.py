@@ -322,7 +322,7 @@ def draw_figure(rows: list[dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    """Run the command of the command line."""
+    """Run the step that the command line names."""
     parser = argparse.ArgumentParser(description="Compare wrappers and heads for uncertainty.")
     parser.add_argument("step", choices=("measure", "page"))
     parser.add_argument("root", type=Path, nargs="?", help="folder of the UCI sets")

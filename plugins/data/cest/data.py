@@ -36,7 +36,7 @@ NotNegative = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 GENERATOR_VERSION, FIT_VERSION = "1", "3"
 """Version of the generator, and of the fit whose results are stored in the cache."""
 FILE = "brain.npz"
-"""Name of the volume in a folder."""
+"""Name of a volume's file in a folder."""
 CYCLE = (0, 0, 1, 0, 0, 2)
 """Splits of consecutive bands, repeated over the volume: 0 training, 1 validation, 2 test."""
 _log = logging.getLogger(__name__)
@@ -49,7 +49,7 @@ class Slice(NamedTuple):
         spectra: Z of the voxels at the model's offsets, (voxel, offset) float32.
         lines: All fitted parameters, (voxel, p) float64; the first columns are the target.
         place: Index of each voxel in the volume, (voxel, 3).
-        region: Number of each voxel's region, (voxel,).
+        region: Index of each voxel's region among the groups, (voxel,).
     """
 
     spectra: Tensor

@@ -83,7 +83,7 @@ class Source:
         return cache.folder(self.archive.name) if self.root is None else None
 
     def fingerprint(self, synthetic: bool) -> dict[str, str]:
-        """Return the entries "root" (source) and "version" of `Data.fingerprint`.
+        """Return the entries of `Data.fingerprint` that say where the images come from: "root" and "version".
 
         Args:
             synthetic: Whether the images are synthetic, in a user's folder or in the cache.

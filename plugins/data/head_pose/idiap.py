@@ -39,7 +39,7 @@ class Idiap(Heads):
         generator_seed: Seed of the generated images.
 
     Raises:
-        ConfigError: `angles_in` is "degrees", but the labels are generated, in radians.
+        ConfigError: `angles_in` is "degrees", but no `root` is given; generated labels are in radians.
     """
 
     bibtex = "ba2005evaluation, tosato2013characterizing"

@@ -82,7 +82,7 @@ def _read_struct(content: h5py.File, name: str) -> list[Label]:
 
 
 def _member(group: Any, name: str) -> Any:
-    """Return a member of an HDF5 group, but never follow a link, because opening a pipe elsewhere would never end.
+    """Return a member of an HDF5 group; refuse a link, because its target may be a pipe, which would never open.
 
     Raises:
         ValueError: The name leads to another place of this file or to another file.

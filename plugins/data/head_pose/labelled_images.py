@@ -79,7 +79,7 @@ class Labels(NamedTuple):
     """Labels of a data set.
 
     Attributes:
-        samples: Labelled images by split; without "validation" the published test set is halved.
+        samples: Labelled images by split. If "validation" is missing, half of the test images are used for validation.
         faults: Errors of labels that could not be read; they count as unreadable images.
         left_out: Clause about images that the labels themselves exclude; it is part of the message about an empty
             split.

@@ -1,8 +1,9 @@
 """`python -m plugins.data.human_scans.animate <run> [<who>]` animates a person who turns or follows a motion file.
 
 Each frame shows side by side the registered mesh with its vertex colours, the image that the trained network renders,
-and, for generated people, the photograph. <run> is a run of smplpix/quick or of a similar experiment. <who> is a test
-subject of its data, or a coloured mesh of its topology (metres, y up, facing z).
+and, for generated people, the photograph. <run> is a run of smplpix/quick or of a similar experiment. <who> is the name
+of a test subject of the run's data, or the file of a mesh with vertex colours in the topology of these data (metres, y
+up, facing z).
 """
 
 import argparse
@@ -35,7 +36,7 @@ NEARLY_WHITE = 248  # of 255: colours of a GIF's palette from here on become the
 
 
 def main(arguments: list[str]) -> None:
-    """Write the animation, frame by frame.
+    """Write the animation that the command's arguments describe, and print the path of its file.
 
     Raises:
         UserError: the run is of other data, the person does not exist, or a file cannot be read or written.

@@ -7,7 +7,8 @@ mesh in each requested pose and shape, with cameras, so that a trained renderer 
 
     python -m framework mode=predict checkpoint=<run> mode.files=<folder>
 
-Each mesh is written with its root over the origin and its lowest vertex at the original height: metres, y up, facing z.
+The written meshes are in metres, with y up, and face z. The root of each is above the origin, and its lowest vertex is
+at the height of the registration's lowest vertex.
 """
 
 import argparse
@@ -100,7 +101,7 @@ def subject(body: Body, few: Body, registration: RegisteredMesh, source: str) ->
 
 
 def a_pose_with(changes: str) -> Float[np.ndarray, "1 movement"]:
-    """Return the movements, degrees, of an A-pose, some of which `changes` replaces: "left raise=90,left elbow=60".
+    """Return the movements, degrees, of an A-pose with changes such as "left raise=90,left elbow=60".
 
     Raises:
         DataError: no movement has such a name, or an angle is not a number.

@@ -39,7 +39,7 @@ class Pair(NamedTuple):
 def find_pairs(root: Path) -> list[Pair]:
     """Return the pairs of a file of images and a file of labels (idx format) in a folder, sorted by name.
 
-    If the folder holds a file both packed by gzip and unpacked, the unpacked file is used.
+    If a file is there twice, packed by gzip and unpacked, the unpacked one is used.
 
     Raises:
         DataError: A file of images has no file of labels, or the reverse.

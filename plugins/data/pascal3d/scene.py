@@ -53,8 +53,8 @@ class AnnotatedObject(NamedTuple):
         box: First column, first row, last column and last row of the object, counted from 0.
         truncated, occluded, difficult: Flags of the annotation.
         fine: False if only a coarse label is given.
-        symmetry: n if the object looks the same after a rotation by 360°/n about the vertical; 0 if it does so after
-            any.
+        symmetry: n if the object looks the same after a rotation by 360°/n about the vertical; 0 if it looks the same
+            after any such rotation.
     """
 
     category: str

@@ -54,7 +54,7 @@ QUANTILES: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
         (-88, -21, -13, -5, -2, 0, 2, 4, 8, 11, 15),
     ),
 }
-"""Elevation and tilt of each class, degrees, at `LEVELS`.
+"""Quantiles of the elevation and of the tilt of each class, degrees, at the probabilities `LEVELS`.
 
 The angles were measured on the 2,108 objects of PASCAL3D+ (Xiang et al., WACV 2014) that are in the VOC 2012 validation
 set and neither truncated, occluded nor difficult.

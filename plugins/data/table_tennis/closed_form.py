@@ -14,8 +14,9 @@ from plugins.data.table_tennis.contact import Spring
 
 DIGITS = 50
 Motion = Callable[[Any], tuple[Any, Any]]
-"""Function from the seconds since a phase began to the height of the ball, 0 where it touches the table, and its upward
-velocity.
+"""Function that returns height and upward velocity of the ball for a time since the start of a phase, seconds.
+
+The height is 0 where the ball touches the table.
 """
 
 
@@ -124,9 +125,9 @@ def _first_root(value: Callable[[Any], Any], scale: Any, longest: Any) -> Any | 
 
 
 def _end_of_loose(z: Any, speed: Any, fall: Any, rate: Any, damping: Any) -> Any:
-    """Return when a ball that is inside the table and not pushed by it leaves the table or is pushed again.
+    """Return the time at which a ball that is inside the table, but not pushed by it, leaves it or is pushed again.
 
-    The arguments are as for `_damped_oscillation`; they describe the state at time 0.
+    The arguments are those of `_damped_oscillation`. At time 0 the ball is in the phase "loose" (see `solvers.flight`).
     """
     discriminant = speed**2 + 2 * fall * z
     leaves = (speed - mpmath.sqrt(discriminant)) / fall if discriminant >= 0 else None

@@ -161,8 +161,8 @@ class _Walk:
     def _solver(self, state: NDArray[np.float64], end: float, phase: str) -> OdeSolver:
         """Return a solver whose absolute tolerance fits this phase, and whose first step is shorter than the phase.
 
-        In a hard table the tolerance of the height is relative to g/Ω², and in a small hop relative to the height of
-        the hop. With a tolerance relative to 1 m, the ball might leave the table on its lower side.
+        The tolerance of the height is relative to g/Ω² while the ball is inside the table, and to the height of a hop
+        that is lower than 1 m. With a tolerance relative to 1 m, the ball might leave the table on its lower side.
         """
         gravity, (height, climb) = self.constants.gravity, state[[2, 5]]
         first, height_scale, speed_scale = np.inf, 1.0, 1.0

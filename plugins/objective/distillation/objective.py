@@ -24,9 +24,9 @@ class Distillation(Objective):
     """A penalty on predicted densities q that differ from the densities p of a trained model, the teacher.
 
     The penalty is the weight times the mean of KL(p ‖ q) over the samples of the batch, nats (Hinton, Vinyals & Dean
-    2015). Its gradient is that of the cross-entropy of p and q, so that the best q of unlimited size is p. If the
-    teacher is an ensemble, p is the mixture of its members, and one network learns the density of the whole ensemble.
-    The loss on the targets of the data stays: the teacher has the share weight/(1 + weight) of the sum.
+    2015). It has the same gradient as the cross-entropy of p and q, and is smallest for q = p. If the teacher is an
+    ensemble, p is the mixture of its members, and one network learns the density of the whole ensemble. The penalty is
+    added to the loss on the targets of the data, which has the weight 1.
 
     The teacher predicts in evaluation mode and is not trained. The trained student does not contain the teacher. Batch
     norm normalises by the moments of the batch, and does not update the running moments.

@@ -36,7 +36,7 @@ def write_teacher(
         head: density head.
         members: number of members; None for a single model.
         shape: shape of an input.
-        described: further fields of the description.
+        described: further fields of the `Description` that the checkpoint stores.
     """
     config: Resolved = {
         "data": {"name": "moons", "data_seed": 0},

@@ -2,8 +2,8 @@
 
 Arrays are described in `raster`. When an edge moves, the integral of the image changes by the difference of the colours
 on the two sides of the edge, times the area that the edge sweeps (Li et al. 2018, eq. 4). If two neighbouring pixels
-show surfaces of different depth, an edge passes between them once. A pair of pixels in a row measures motion along the
-row; a pair in a column measures motion along the column.
+show surfaces of different depth, the edge at which the nearer surface ends lies between them (`find_edge`). Two pixels
+of a row give the gradient with respect to motion of this edge along the row; two pixels of a column, along the column.
 """
 
 from typing import no_type_check

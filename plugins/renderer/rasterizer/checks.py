@@ -35,7 +35,7 @@ class CheckedScene:
         scene: the scene before the checks.
         vertices, colors, texture: inputs in number types that kernels read; None if they are not drawn.
         faces: faces of the scene.
-        corners: faces of the texture.
+        corners: indices of the texture coordinates at the corners of each face; None if no texture is drawn.
         lens: fx, fy, cx, cy, pixels.
         near: distance of the near plane, metres.
         needs_gradient: whether an input requires a gradient.

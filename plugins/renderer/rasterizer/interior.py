@@ -2,10 +2,10 @@
 
 The gradients are with respect to colours, textures, vertices and camera. Arrays are described in `raster`; an array
 `grad_x` is the gradient of the loss with respect to x. In camera coordinates a pixel's ray is r = ((column - cx) / fx,
-(row - cy) / fy, 1), and the barycentric weights of a face A, B, C under it are m_i / Σ m with m_0 = r·(B×C), m_1 =
-r·(C×A), m_2 = r·(A×B) (homogeneous edge functions, Olano & Greer 1997): linear in every corner, and valid for corners
-behind the camera. For a pixel beside its face, r is the ray to the point of the face that `shading` shows there; the
-gradient treats this ray as constant.
+(row - cy) / fy, 1). Where it meets a face with the corners A, B, C, the barycentric weights are m_i / Σ m with m_0 =
+r·(B×C), m_1 = r·(C×A), m_2 = r·(A×B) (homogeneous edge functions, Olano & Greer 1997). Each m_i is linear in every
+corner, and corners behind the camera are allowed. For a pixel beside its face, r is the ray to the point of the face
+that `shading` shows there; the gradient treats this ray as constant.
 """
 
 from typing import no_type_check
