@@ -191,8 +191,8 @@ class Backbones(Encoder):
 class RawNetwork(nn.Module):
     """Base class of modules other than `Model` that compute raw parameters, such as the stacked members of an ensemble.
 
-    Its results must be a function of its inputs and of its second argument, the number of members, alone. A frozen
-    predictor may therefore replace it by code that does not use torch.
+    Its results must depend only on its two arguments: the inputs and the number of members. A frozen predictor may
+    therefore replace it by code that does not use torch.
     """
 
 

@@ -102,8 +102,8 @@ class SelfTraining(ABC):
         rows: for each sample of the next prediction, its number among the samples that trained the models, (batch,);
             the wrapper then predicts the sample by the models that did not see it. None: all models predict. The
             attribute is set by `held_out` only.
-        part_count: number of parts of the samples, if each sample belongs to exactly one part, and all models either
-            saw the whole part or no sample of it; 0 if the wrapper divides the samples in another way.
+        part_count: number of parts of the samples, if each sample belongs to exactly one part, and each model saw a
+            part as a whole or not at all; 0 if the wrapper divides the samples in another way.
         left_out: number of a part; all samples of the next prediction are then predicted by the models that did not see
             this part, also after loading. None: `rows` decides.
     """
@@ -113,9 +113,10 @@ class SelfTraining(ABC):
     left_out: int | None = None
 
     def part_of(self, rows: Int[Tensor, "sample"]) -> Int[Tensor, "sample"]:
-        """Return the part to which each of these samples belongs that trained the models.
+        """Return the number of the part to which each sample belongs, (sample,).
 
-        It is called after `train_models` of the same object, and only if `part_count` is above 0.
+        `rows` are the numbers of the samples among those that trained the models. The method is called after
+        `train_models` of the same object, and only if `part_count` is above 0.
         """
         raise NotImplementedError
 

@@ -41,7 +41,9 @@ def log_marginal(angle: Float[Tensor, "..."], frame: Frame, index: int) -> Float
     integral over one of the other two angles is a Bessel function. The integral over the last angle is computed by
     quadrature. For the azimuth a and quadrature over the elevation e this is
 
-        p(a) = ∫ cos e / (4π k(λ)) exp(-μ) I₀ₑ((ν-μ)/2) de.
+        p(a) = ∫ cos e / (4π k(λ)) exp(-μ) I₀ₑ((ν-μ)/2) de
+
+    with the normaliser k(λ) of the density of the rotation and I₀ₑ(x) = I₀(x) exp(-x) (aligned_rotations).
     """
     shape = broadcast_shapes(angle.shape, frame.falls.shape[:-1])
     parts = (quaternions.of_matrix(frame.left), quaternions.of_matrix(frame.right), frame.falls)
@@ -62,10 +64,11 @@ def log_marginal(angle: Float[Tensor, "..."], frame: Frame, index: int) -> Float
 def _log_integral(
     angle: Tensor, left: Tensor, right: Tensor, falls: Tensor, index: int, count: int | None
 ) -> Tensor:
-    """Return the log of the density of one angle, without the factor 1/k(λ): the integral over the other two angles.
+    """Return the log-density of one angle, nats, without the constant -log k(λ) (`log_marginal`).
 
-    `index` says which angle it is, as in `log_marginal`; `left`, `right` and `falls` are attributes of the argument
-    `frame` of `log_marginal`. The integral over the third angle is a Bessel function. The integral over the second one
+    It is the density of all three angles, integrated over the other two. `index` says which angle it is, as in
+    `log_marginal`; `left`, `right` and `falls` are attributes of the argument `frame` of `log_marginal`. The integral
+    over the third angle is a Bessel function. The integral over the second one
     is a quadrature with `count` fixed nodes or, if `count` is None, with nodes around the peaks.
     """
     around = index == 1  # quadrature runs over the azimuth then, otherwise over the elevation

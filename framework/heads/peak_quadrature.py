@@ -11,7 +11,7 @@ from torch import Tensor
 GRID = 64
 """Number of equal cells into which the interval is divided for the search of peaks."""
 PEAKS = 2
-"""Largest number of peaks that have nodes of their own; if there are more, these are the highest peaks."""
+"""Largest number of peaks that get nodes of their own; if there are more peaks, only the highest ones get them."""
 ROUNDS = 14
 """Number of rounds that refine a peak.
 

@@ -31,7 +31,7 @@ class Unit(NamedTuple):
 
     @property
     def log_volume(self) -> float:
-        """Logarithm of the volume by which the map from the head's unit to the target's unit expands space, nats.
+        """Logarithm of the factor by which the map from the head's unit to the target's unit multiplies volumes, nats.
 
         It is the sum of the logarithms of `scale`, or 0 if there is no scale.
         """

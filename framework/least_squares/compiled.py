@@ -16,7 +16,7 @@ EPSILON = float(np.finfo(np.float64).eps)
 LEAST_DAMPING, MOST_DAMPING = 1e-30, 1e20
 """Smallest and largest damping."""
 SLIGHT = 1e-2
-"""Damping below which less damping gives no better step, as a multiple of the Cholesky factor's smallest pivot²."""
+"""Damping that hardly changes a step, so that less is not needed; in units of the Cholesky factor's smallest pivot²."""
 QUIET = 4
 """Number of successive steps that end a problem if their gain is negligible or smaller than rounding errors."""
 SINGULAR = 1e-7
@@ -24,7 +24,7 @@ SINGULAR = 1e-7
 CLIPS = 3
 """Number of times that a step that leaves the bounds is solved again, with the parameters beyond a bound held there."""
 NEAR = 0.1
-"""Largest share of the cost that a step may remove if the minimum is to count as near after the step."""
+"""Share of the cost; if an accepted step lowers the cost by at most this share, the minimum counts as near."""
 GOES_ON, LIMIT, STEP, COST, GRADIENT = 10, 0, 3, 2, 1
 """Values of `ended` in `judge_steps`: GOES_ON for a problem that has not ended, else a value of `solution.Status`."""
 

@@ -22,7 +22,7 @@ from framework.training.process_count import require_processes
 
 
 def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float | None:
-    """Run the mode that a composed config chooses; return the number that a sweeper minimises, None without one.
+    """Run the mode that a composed config chooses; return its number for a sweeper to minimise, or None if it has none.
 
     Args:
         values: Composed config.

@@ -37,7 +37,7 @@ from framework.storage.progress import Work, output
 from framework.training.batches import Batches
 
 DESCRIPTION, NAMES = INDEX, "files.txt"
-"""Two files beside the features: settings of the computation, and names of the encoded files, one per line."""
+"""Names of two files beside the features: one holds the settings of the computation, one the encoded files' names."""
 
 
 class EncodeOptions(Options):
@@ -218,7 +218,7 @@ def describe_work(collection: Collection, parts: Mapping[str, Any], count: int) 
 
 
 def data_of(shards: Shards, config: Config) -> Mapping[str, Any] | None:
-    """Return the resolved config of the data set that has read the files of a folder of shards; None if none is known.
+    """Return the resolved config of the data set that read the files from which shards were made; None if not known.
 
     Raises:
         ConfigError: The command chooses another data set, or sets a key that only affects the reading of files.
@@ -392,7 +392,7 @@ def encode(
 
 
 def join(batches: Sequence[Tensor]) -> Tensor:
-    """Return batches as one batch; point clouds are padded to the largest with rows of NaN."""
+    """Return several batches as one; point clouds get rows of NaN until all are as long as the largest."""
     if len({batch.shape[1:] for batch in batches}) == 1:
         return torch.cat(list(batches))
     return pad([cloud for batch in batches for cloud in batch])

@@ -106,7 +106,9 @@ def run(config: Config) -> None:
 
 
 def _apply_budget(session: Session, data: Data | None, mass: float | None) -> str:
-    """Set the knobs of the session's model to meet the command's budget, print why, and return that; "" without one.
+    """Set the knobs of the session's model to meet the command's budget, and print and return the reason.
+
+    Without a budget, the function changes and prints nothing, and returns "".
 
     Args:
         session: Session of the command.

@@ -65,9 +65,9 @@ OF_FILES = (
     ),
     *("background", "truth"),
 )
-"""Options that only frames of files have."""
+"""Options that apply to scene files only, and not to the scenes of a data set."""
 OF_A_VIEW = OF_FILES[:8]
-"""Options that a camera file replaces."""
+"""Options that describe the camera, which a camera file (`mode.camera`) replaces."""
 OF_TRAINING = (
     "encoder",
     "density_head",
@@ -118,7 +118,7 @@ class RenderOptions(Options):
 
 @dataclass(frozen=True)
 class Scenes:
-    """Frames of a command, read when they are drawn.
+    """Frames that a command draws; the scene of a frame is read shortly before it is drawn.
 
     Attributes:
         title: name of the scenes in tables.
@@ -412,7 +412,11 @@ def _method(config: Config, chosen: Mapping[str, Any]) -> str:
 
 
 def _require_drawable(cls: type[Renderer], channels: Sequence[str], ground: Ground) -> None:
-    """Raise the error of `Painter` for a renderer that is not built yet."""
+    """Refuse a renderer class that cannot draw the channels on the background `ground`, before an object is built.
+
+    Raises:
+        ConfigError: `Painter` refuses the channels or the background.
+    """
     declared = type(cls.__name__, (), {"channels": cls.channels, "background": cls.background})
     Painter(declared(), ground, tuple(channels))  # type: ignore[arg-type]
 

@@ -176,9 +176,9 @@ def _landscape_figure(session: Session) -> Figure:
 
 
 def log_density_on_circle(density: Distribution) -> tuple[Tensor, Tensor]:
-    """Return POINTS angles, and the log-densities at them (POINTS, batch), also of very narrow densities.
+    """Return POINTS angles on the circle, (POINTS,), and the log-densities at these angles, (POINTS, batch), nats.
 
-    A density that is too narrow for the grid is estimated from the share of its random values in each grid cell.
+    If a density is too narrow for this grid, it is estimated from the share of its random values in each grid cell.
     """
     angles, log_density = circular_grid(density, POINTS)
     width = 2 * math.pi / POINTS
@@ -212,7 +212,7 @@ def _caption(error: float, entropy: float, symmetry: int) -> str:
 
 
 def _equally_true(truth: float, symmetry: int) -> np.ndarray:
-    """Return the angles that are true because of the n-fold `symmetry`, radians; none for 0, if every angle is true."""
+    """Return all true angles of an object with n-fold `symmetry`, radians; [] for 0, where every angle is true."""
     return truth + 2 * math.pi / symmetry * np.arange(symmetry) if symmetry else np.zeros(0)
 
 

@@ -1,4 +1,4 @@
-"""Result tables: numbers with their errors, for the terminal, in Markdown, HTML and LaTeX, and as CSV."""
+"""Result tables of numbers with their errors: for the terminal, in Markdown, in HTML, in LaTeX and as CSV."""
 
 import math
 import re
@@ -62,9 +62,9 @@ def results_table(
         columns: headings by key, in order; the first column names the result.
         title: title above the table. If all results are synthetic, "(synthetic data)" is added to it; if only some are,
             a further column says which.
-        better: "higher" or "lower" for the keys of columns in which the best number may be bold, whichever is better; a
-            single result is never bold. Headings have arrows in these directions. None: the arrows are those of the
-            first row's "better", if it has one.
+        better: "higher" or "lower", whichever is better, for the key of each column in which the best number may be
+            bold. A single result is never bold. The headings of these columns have arrows. None: the arrows are those
+            of the first row's "better", if it has one.
     """
     synthetic = [_synthetic(row) for row in rows]
     if rows and all(synthetic) and "synthetic" not in title.lower():
@@ -97,8 +97,8 @@ def markdown(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better 
     Args:
         rows: the results, one per row.
         columns: headings by key, in order; the first column names the result.
-        better: "higher" or "lower" for the keys of columns in which the best number may be bold, whichever is better;
-            None: no number is bold.
+        better: "higher" or "lower", whichever is better, for the key of each column in which the best number may be
+            bold; None: no number is bold.
     """
     lines = _lines(rows, columns, better or {}, origin=any(map(_synthetic, rows)))
     cells = [[_escape(cell) for cell in line] for line in lines]
@@ -116,8 +116,8 @@ def html(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | No
     Args:
         rows: the results, one per row.
         columns: headings by key, in order; the first column names the result.
-        better: "higher" or "lower" for the keys of columns in which the best number may be bold, whichever is better;
-            None: no number is bold, and no heading has an arrow.
+        better: "higher" or "lower", whichever is better, for the key of each column in which the best number may be
+            bold; None: no number is bold, and no heading has an arrow.
     """
     lines = _lines(rows, columns, better or {}, origin=any(map(_synthetic, rows)))
     _add_arrows(lines[0], columns, better)
@@ -143,8 +143,8 @@ def latex(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | N
     Args:
         rows: the results, one per row.
         columns: headings by key, in order; the first column names the result.
-        better: "higher" or "lower" for the keys of columns in which the best number may be bold, whichever is better;
-            None: no number is bold.
+        better: "higher" or "lower", whichever is better, for the key of each column in which the best number may be
+            bold; None: no number is bold.
     """
     lines = _lines(rows, columns, better or {}, origin=any(map(_synthetic, rows)))
     head, *body = (" & ".join(_latex_cell(cell) for cell in line) + r" \\" for line in lines)
@@ -378,7 +378,7 @@ def _column(lines: Sequence[Sequence[Text]], index: int) -> list[Text]:
 
 
 def _wrap(heading: str, width: int) -> str:
-    """Return a heading, wrapped between words to lines of `width` characters or, if longer, of its longest word."""
+    """Return a heading with line breaks between words; lines have at most `width` characters, if each word fits."""
     # A single sign, such as "°" or "/", stays with the word before it.
     words = re.sub(r" (?=[^\w\s]( |$))", NO_BREAK, heading)
     width = max([1, width, *map(len, words.split(" "))])

@@ -203,7 +203,7 @@ def _find_learning_rate(session: Session, run: Run, fed: Data) -> float:
     Args:
         session: session of the training.
         run: run in progress.
-        fed: data with which the model is trained; other than those of the session if features are precomputed.
+        fed: data with which the model is trained: the session's data, or precomputed features of these data.
     """
     path = run.folder / RANGE_TEST
     if run.resumed and path.is_file():

@@ -15,7 +15,7 @@ from framework.target import Target
 MOST = 12
 """Largest number of names that a line lists."""
 BUSY = 1.0
-"""Smallest load of the machine that the output mentions."""
+"""Smallest load of the machine at which the output states the load (`Cores.load`)."""
 
 
 def introduce(data: Data, console: Console) -> None:

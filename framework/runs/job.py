@@ -16,7 +16,7 @@ from framework.storage.plain_values import read_json
 PARENT = "FRAMEWORK_SWEEP_PARENT"
 """Environment variable with the id of the sweep's run in the tracking store, which becomes the parent of the job."""
 SYNCED_WITHIN = 60.0
-"""Largest duration, in seconds, of a job that sends nothing to the tracking store; its sweep sends the journal."""
+"""Seconds before a job sends anything to the tracking store; the journal of a shorter job is sent by its sweep."""
 RECORD = "job.json"
 VALUE = "value.json"
 PRUNED = "pruned.txt"
@@ -69,7 +69,7 @@ def natural_order_key(folder: Path) -> list[tuple[int, str]]:
 def find_job_folders(folder: Path) -> list[Path]:
     """Return the folders of a sweep's jobs at any depth, sorted by `natural_order_key`.
 
-    Jobs of another sweep, whose folder lies in this one, are left out.
+    If the folder of another sweep lies in this folder, the jobs of the other sweep are left out.
     """
     job_folders = []
     for name, below, files in os.walk(folder):

@@ -1,6 +1,6 @@
 """Reading of the commit and state of the git repository around a folder, without running programs that it names.
 
-A repository may come from an untrusted source (DESIGN, law 15), and git runs the programs in the configuration of a
+A repository may come from an untrusted source (SECURITY.md), and git runs the programs in the configuration of a
 repository (`core.fsmonitor`, filters, hooks). The commit is therefore read from plain files. To find out whether files
 differ from the commit, git is run in a temporary repository. The temporary repository shares the objects of the
 original one, and has a copy of its index and a few harmless settings of its configuration.

@@ -77,8 +77,8 @@ def read_command(
     command sets them.
 
     Raises:
-        ConfigError: The run has finished, its files are damaged, or the command changes the run's config or does not
-            repeat its paths.
+        ConfigError: The run has finished, its files are damaged, or the command changes the run's config. Or the
+            config names files, and the command does not repeat their paths (`stored.<key>=<path>`).
     """
     keys = {item: item.lstrip("+~").partition("=")[0] for item in overrides}
     allowed = ("resume", "checkpoint", *CHANGEABLE)  # and keys `stored.…`, which repeat stored paths

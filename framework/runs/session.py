@@ -226,7 +226,7 @@ def for_training(config: Config) -> Session:
     if trains_itself is not None and reader is not None:
         raise ConfigError(
             f"{type(reader).__name__} reads the training split of the model that it wraps, but "
-            f"{type(trains_itself).__name__} trains each model on a part of this split. Leave one of the two out of "
+            f"{type(trains_itself).__name__} trains each model on a part of this split. Remove one of the two from "
             "`uncertainty`."
         )
     if trains_itself is not None and not resumed:
@@ -580,9 +580,15 @@ def _read_files(
 def _count_idle_samples(
     description: Description, read_chosen: Callable[[Sequence[Path]], Dataset[Batch]], files: Sequence[Path]
 ) -> int | None:
-    """Return the number of the first samples that the data set of the model reads in the same way, None if one differs.
+    """Compare the model's own data set with the chosen one; return the number of equal samples, None if one differs.
 
-    The arguments are those of `_read_files`; `_count_equal_samples` limits the number.
+    The first samples of the files are compared, as `_count_equal_samples` describes. The result is also None if the
+    model's own data set cannot read the files.
+
+    Args:
+        description: Description of the model.
+        read_chosen: Method `read` of the data set that the command chooses.
+        files: Files of the user.
     """
     stored = read(Path(description.path))["framework"]["config"]["data"]
     try:
@@ -596,7 +602,7 @@ def _count_idle_samples(
 def _count_equal_samples(
     stored: Data, read_chosen: Callable[[Sequence[Path]], Dataset[Batch]], files: Sequence[Path]
 ) -> int | None:
-    """Return the number of samples that two data sets read alike from the first files, or None if any sample differs.
+    """Compare the samples that two data sets read from the first files; return their number, or None if one differs.
 
     Args:
         stored: Data set that the model was trained on.

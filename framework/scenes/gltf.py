@@ -87,7 +87,7 @@ def _find_unsupported(document: Document, key: str) -> list[str]:
 
 
 def _count_parts(document: Document, shown_nodes: Iterable[int]) -> int:
-    """Return the number of parts of these nodes, without reading any part."""
+    """Return the number of parts (primitives of meshes) that these nodes show, without reading any part."""
     nodes = (document.item("nodes", number) for number in shown_nodes)
     return sum(len(document.item("meshes", node["mesh"])["primitives"]) for node in nodes if "mesh" in node)
 

@@ -119,7 +119,7 @@ class Document:
         return memoryview(buffer)[start : start + length], whole_number(described.get("byteStride", 0))
 
     def numbers(self, number: Any, width: int, *, shares: bool = False) -> NDArray:
-        """Return the numbers of an accessor, (count, width): stored integers, or float64.
+        """Return the numbers of an accessor, (count, width): integers in their stored type, other numbers in float64.
 
         Args:
             number: number of the accessor.

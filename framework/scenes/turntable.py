@@ -36,8 +36,8 @@ UPRIGHT = {
 }
 """Rotations that make z the upward axis of a scene, by the axis that points upwards before the rotation.
 
-The front of a scene looks towards z if y points upwards, and towards -y if z does. After the rotation it looks towards
--y.
+The front of a scene looks towards z if y points upwards, and towards -y if z points upwards. After the rotation it
+always looks towards -y.
 """
 IMAGE = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64).diag()
 """Rotation from a viewer's axes (x right, y up, z backwards) to a camera's axes."""

@@ -15,7 +15,7 @@ from framework.spectra.spectrum import COUNT, Misfit, Parameters
 CUT = 10.0
 """Limit to which the absolute values of measured Z are clipped; true values lie between 0 and about 1."""
 DECREASE = 1e-10
-"""Share of the cost: the search ends when a step would lower the cost by less than this share.
+"""Smallest relative decrease of the cost: the search ends when a step would lower the cost by a smaller share.
 
 The last step is Newton's. After it, a further step could lower the cost only by about the square of this share.
 """
@@ -24,7 +24,7 @@ CAREFUL, BOLD = 1e-1, 1e-3
 DOUBTFUL = 1e-4
 """Smallest pivot with which the Cholesky factor of a scaled inverse covariance has eight correct digits."""
 LEAST_SHARE = 1e-9
-"""Smallest standard deviation that residuals are taken to have, so that a spectrum without noise has a covariance."""
+"""Smallest standard deviation that is assumed for residuals, so that a spectrum without noise has a covariance."""
 
 
 class Fit(NamedTuple):
@@ -66,7 +66,7 @@ def fit(
         measured: measured Z; NaN where nothing was measured.
         offsets: ppm.
         parameter_set: the parameters to fit.
-        start: values of all p parameters; the columns of parameters that are not targets may be left out.
+        start: start values; the last columns, which belong to parameters that are not the target, may be left out.
         most: largest number of steps tried.
     """
     device = measured.device

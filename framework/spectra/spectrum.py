@@ -26,7 +26,7 @@ class Parameters(NamedTuple):
     """The fitted parameters of spectra: their names, bounds and start values, and how many of them are the target.
 
     Attributes:
-        names: with units; amplitudes are shares of the unsaturated signal.
+        names: names with units; amplitudes are shares of the unsaturated signal.
         lower: lower bounds.
         upper: upper bounds.
         start: values at which the search starts.

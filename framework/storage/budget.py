@@ -1,9 +1,9 @@
 """Limit on the memory that building or running a model from an untrusted checkpoint may allocate.
 
-A checkpoint of a few kilobytes can describe a layer of 10⁹ weights. That the stored weights do not fit is noticed only
-when they are copied into the model, and by then the model has been built. `Budget` therefore inspects every operation
-of torch before it runs, computes the size of the result from shapes alone, and raises an error before the memory is
-allocated.
+A checkpoint of a few kilobytes can describe a layer of 10⁹ weights. The stored weights then do not fit, but an error
+is raised only when they are copied into the model, after the model has been built. `Budget` therefore inspects every
+operation of torch before it runs, computes the size of the result from shapes alone, and raises an error before the
+memory is allocated.
 
 The sizes are computed by formulas in this module. torch can compute shapes on its device "meta", but some operations
 then import torch's compiler, which takes 0.9 s.

@@ -165,7 +165,7 @@ def hold_lock(path: Path) -> Iterator[None]:
 
 
 def lacks_locks(error: BaseException) -> bool:
-    """Return whether an error says that the file system does not support the lock."""
+    """Return whether an error says that the file system does not support locks."""
     return isinstance(error, NotImplementedError) or (isinstance(error, OSError) and error.errno in _NO_LOCKS)
 
 

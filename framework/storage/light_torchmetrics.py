@@ -29,7 +29,7 @@ class _Plots(ModuleType):
 
 
 class _Signal(ModuleType):
-    """Stand-in for SciPy's module `signal` with the name `hamming`, which torchmetrics would add otherwise."""
+    """Stand-in for SciPy's module `signal`; it has `hamming`, so that torchmetrics does not try to add this name."""
 
     hamming = None
 

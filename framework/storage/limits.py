@@ -89,9 +89,9 @@ compressed zeros would decompress to 134 million values.
 # scenes
 
 MOST_PARTS, MOST_MATERIALS = 10_000, 10_000
-"""Largest number of parts of a scene, each of which has one material and takes a millisecond, and of materials."""
+"""Largest number of parts of a scene, and of its materials; a part has one material and takes a millisecond."""
 MOST_TEXELS, FEW_TEXELS, TEXELS_PER_BYTE = 2**25, 2**24, 16
-"""Largest number of texels in all textures of a scene, which fits two textures of 4096 × 4096.
+"""Largest number of texels in all textures of a scene, enough for two textures of 4096 × 4096.
 
 If the textures have more than TEXELS_PER_BYTE texels for each byte of their files, which photographs never have, the
 limit is FEW_TEXELS (one such texture). A texel takes 44 bytes while the scene is drawn.

@@ -56,9 +56,10 @@ NAMED = frozenset(
         *(f"torch {name}Storage" for name in NUMBERS.values() if name),
     }
 )
-"""Globals that a pickle of plain values and dense tensors names without calling them, as "module name" of Python 3.
+"""Globals that a pickle of plain values and dense tensors names without calling them.
 
-`CALLED` contains the globals that such a pickle calls.
+Each is written as its module and its name in Python 3, with a blank between them. `CALLED` contains the globals that
+such a pickle calls.
 """
 TYPES = frozenset(getattr(torch, name) for name in NUMBERS)
 MOST_EXPANDED = 1000

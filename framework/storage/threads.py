@@ -30,7 +30,7 @@ class Pool:
         self.threads = None
 
     def run(self, work: Callable[[int], object], threads: int) -> None:
-        """Call work(0) … work(threads - 1) concurrently, work(0) in the calling thread; `work` may not use the pool."""
+        """Call work(0) … work(threads - 1) concurrently, work(0) in this thread; `work` must not use the pool."""
         if threads <= 1:
             work(0)
             return

@@ -183,7 +183,7 @@ def describe_mismatch(
 
 LARGEST = torch.finfo(torch.float64).max
 FINITE, FROM_0 = (-LARGEST, LARGEST), (0.0, LARGEST)
-"""Bounds (least, largest) of a buffer for `require_state`: any finite number; at least 0."""
+"""Bounds of a buffer for `require_state`: FINITE allows every finite number, FROM_0 those of at least 0."""
 
 
 def require_state(module: nn.Module, **bounds: tuple[float, float] | tuple[Tensor, Tensor]) -> None:

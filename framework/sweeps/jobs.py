@@ -187,8 +187,8 @@ def run(
         devices: CUDA devices to distribute, one to each running job; if empty, all jobs see all devices.
         parent: Id of the tracking run under which the jobs are recorded.
         sender: Object that sends the journals of ended jobs to the tracking store; None without a store.
-        eager: Return as soon as every job has been started, and the engine has confirmed that each job that has not
-            ended waits or runs. The jobs must outlive this process.
+        eager: Return as soon as every job has been started and, for each job that has not ended, the engine has
+            confirmed that the job waits or runs. The jobs must outlive this process.
         watch: Function that is called for each running job in turn, about every `engine.interval` seconds.
 
     Raises:
@@ -325,14 +325,14 @@ def _environment(engine: Engine, slot: int, devices: Sequence[str], parent: str 
 
 
 def _earlier_seconds(record: Mapping[str, Any], config: str) -> float | None:
-    """Return the processor seconds of a job's earlier tries with this config; None if the end of a try was missed."""
+    """Return the processor seconds of a job's earlier tries with this config; None if not all of them are known."""
     if record.get("config") != config:
         return 0.0
     return None if record.get("ended") is None else record.get("processor_seconds")
 
 
 def _attach(job: Job) -> _Running | None:
-    """Take up a job that an earlier command started, if it still runs and its engine can be asked from here.
+    """Take up a job that an earlier command started, if it still runs and this machine can reach its engine.
 
     A job whose config has changed since is cancelled instead.
     """
@@ -347,7 +347,7 @@ def _attach(job: Job) -> _Running | None:
 
 
 def _process_of(handle: str, folder: Path) -> Process | None:
-    """Return the process of a job that an earlier command started; None if its engine cannot be asked from here."""
+    """Return the process of a job that an earlier command started; None if this machine cannot reach its engine."""
     if not re.fullmatch(r"slurm:[0-9]+", handle) or shutil.which("squeue") is None:
         return None
     from framework.sweeps.slurm import SlurmProcess  # imported late: Hydra imports this module at every start

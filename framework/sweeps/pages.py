@@ -172,7 +172,11 @@ def _results(compared: Comparison) -> str:
 
 
 def _differences(compared: Comparison) -> str:
-    """Return the table of paired differences over seeds from the row with the best headline number."""
+    """Return a table, as HTML, of the differences of each row from the best row, paired by seed.
+
+    The best row has the best number of the key that `headline` returns. The result is "" if there is only one row, and
+    a sentence if no two rows have two seeds in common.
+    """
     key = headline(compared)
     if key is None or len(compared.rows) < 2:
         return ""
@@ -295,7 +299,10 @@ def _failures(failed: Sequence[Failed]) -> str:
 
 
 def _notes(runs: Sequence[Mapping[str, Any]]) -> str:
-    """Return what the runs printed before training and about their numbers, each line once with its number of runs."""
+    """Return, as HTML, the notes that the runs printed before training, and the warnings that they printed at any time.
+
+    Equal lines of several runs appear once, with the number of these runs.
+    """
     counts: dict[str, int] = {}
     for run in runs:
         path = Path(run["folder"]) / "console.log"

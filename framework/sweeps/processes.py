@@ -64,7 +64,7 @@ class Process(Protocol):
 
 
 class LocalProcess:
-    """Base class of processes on this machine, with those attributes of `Process` that have one value for all."""
+    """Base class of processes on this machine; it sets the attributes of `Process` that are equal for all of them."""
 
     handle: str | None = None
     alive: bool = True
@@ -127,8 +127,8 @@ class Forks:
 
     A fork differs from a new process (`SeparateProcess`) only in that the modules are already imported. If the server
     dies, its running jobs receive a signal to end. Jobs that had been sent to it, but had not started, run as new
-    processes. For all later jobs another server is started; only if the dead server had never forked a job, they run as
-    new processes too.
+    processes. For later jobs another server is started. If the dead server had never forked a job, no other server is
+    started, and all later jobs run as new processes too.
 
     Args:
         modules: Modules that the server imports.

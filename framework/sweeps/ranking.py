@@ -229,7 +229,9 @@ def write_results(folder: Path, name: str, ranking: Ranking, keys: Sequence[str]
 
 
 def close_ranking(folder: Path, summary: str, config: Mapping[str, Any]) -> None:
-    """Log the files of a search to its parent run in the tracking store, and close the run; do nothing without one.
+    """Log the files of a search to its parent run in the tracking store, and close this run.
+
+    Without a parent run, the function does nothing.
 
     Args:
         folder: Folder of the search.

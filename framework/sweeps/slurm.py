@@ -44,7 +44,7 @@ killed by a signal that SLURM was not asked to send. The script only starts `sru
 its time or by its user has another state.
 """
 _INTERVAL, _SHORT_INTERVAL = 5.0, 1.0
-"""Seconds between two calls of squeue; the second if the end of a job is expected."""
+"""Seconds between two calls of squeue: usually, and while the state of a job is expected to change."""
 
 _log = logging.getLogger(__name__)
 
@@ -280,7 +280,8 @@ QUEUE = _Queue()
 def job_name(folder: Path) -> str:
     """Return the name that SLURM has for the job in `folder`.
 
-    The name shows whether the SLURM job whose handle was read from a file is the job in this folder.
+    A handle that was read from a file may belong to another job of SLURM. The name shows whether it belongs to the job
+    in this folder.
     """
     return f"sweep-{sha256(as_bytes(str(folder))).hexdigest()[:16]}"
 

@@ -49,7 +49,7 @@ class Calibration:
 
     @cached_property
     def target(self) -> Target:
-        """Target of the contract row; a real-valued one is in another unit, since targets may have any size."""
+        """Target of the contract row; a real-valued target is converted to another unit, with values far from 0."""
         return in_units(self.row.target)[:2][-1]
 
     def make(self, target: Target | None = None) -> Uncertainty:

@@ -171,8 +171,8 @@ class OneDevice(TorchFunctionMode):
     def _label_moved(self, name: str, result: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
         """Label the result of `.to`, `.cpu` and similar calls.
 
-        If its label differs from that of the tensor that was moved, a new tensor is returned, so that this tensor keeps
-        its label.
+        If torch returned the same tensor, but the label changes, the result is a new view of it. So the tensor that was
+        moved keeps its own label.
         """
         source = args[0]
         inside = _on_device.get(source)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def weights_of_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return float32 weights for a state, which depend only on the order of its names and on its shapes.
+    """Return float32 weights for all names of a state; they depend only on its names and shapes.
 
     Convolutions have the variance 2 / (number of inputs), factors of batch norm are near 1, offsets are near 0, and
     stored variances are above 0.

@@ -58,10 +58,10 @@ class DrawnGrid:
     Draws that lie far from the others change the width little.
 
     Attributes:
-        borders: Borders of the cells along each standard number, (cells per side + 1,).
+        borders: Borders of the cells along each number of a standardised value, (cells per side + 1,).
         mass: Integral of the density over each cell, (*cells, *batch), float64.
         centre: (*batch, number), float64.
-        root: Upper triangular matrix R, (*batch, number, number): a value is centre + Rᵀ · standard numbers.
+        root: Upper triangular matrix R, (*batch, number, number): a value is centre + Rᵀ · (standardised value).
     """
 
     borders: list[Tensor]
@@ -70,7 +70,7 @@ class DrawnGrid:
     root: Tensor
 
     def standardise(self, value: Tensor) -> Tensor:
-        """Return values, (draws, *batch, number), minus the grid's centre and times the inverse of its root."""
+        """Return (Rᵀ)⁻¹ (value - centre) for values, (draws, *batch, number), with the matrix R = `root`."""
         offset = (value.double() - self.centre).movedim(0, -1)
         return torch.linalg.solve_triangular(self.root.mT, offset, upper=False).movedim(-1, 0)
 

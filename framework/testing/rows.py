@@ -137,7 +137,7 @@ class WrapperRow(Row):
 
 @dataclass(frozen=True)
 class ObjectiveRow(Row):
-    """Parameters with which an objective is checked; inputs are vectors of `framework.testing.wrappers.LENGTH` numbers.
+    """Parameters with which an objective is checked; inputs are vectors of `framework.testing.plain.LENGTH` numbers.
 
     Attributes:
         target: Target of the predictor.

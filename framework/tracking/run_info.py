@@ -104,7 +104,7 @@ class RunInfo:
         )
 
     def at_store(self, store: Address, folder: Path) -> "RunInfo":
-        """Return the record of the run in `folder` with the address `store`, which the user gave, for its store."""
+        """Return this record, of the run in `folder`, with `store` as its store; the user gave this address."""
         return replace(self, uri=store.uri, named=store.named, artifacts=artifact_folder(store.uri, folder))
 
 

@@ -164,7 +164,7 @@ class MlflowTracker(Tracker):
     and the store keeps the first values of these steps.
 
     The import of MLflow takes several seconds. A short run can avoid this import if another process, such as a sweep,
-    calls `sync` afterwards: with `wait`, nothing is sent before that time is over.
+    calls `sync` afterwards: nothing is sent in the first `wait` seconds.
 
     Args:
         folder: Folder of the run.

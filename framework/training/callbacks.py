@@ -112,7 +112,7 @@ class AverageWeights(WeightAveraging):
         return torch.lerp(average, current.to(average.dtype), weight)
 
     def should_update(self, step_idx: int | None = None, epoch_idx: int | None = None) -> bool:
-        """Return whether the present weights enter the average, as after each step from the epoch `first_epoch` on."""
+        """Return True after a step of the epoch `first_epoch` or a later one, whose weights enter the average."""
         return step_idx is not None and self._epoch >= self.first_epoch
 
     def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
@@ -164,7 +164,7 @@ class AverageWeights(WeightAveraging):
         super().on_save_checkpoint(trainer, pl_module, checkpoint)
 
     def _begin(self, pl_module: pl.LightningModule) -> None:
-        """Let the average be the present weights if it has not begun."""
+        """Set the average to the present weights if no weights have entered it yet."""
         if self._average_model is not None and int(self._average_model.n_averaged) == 0:
             self._average_model.module.load_state_dict(deepcopy(pl_module.state_dict()))
 
@@ -173,7 +173,7 @@ class ReturnWeights(BatchCallback):
     """Callback that puts the trained weights back into the model at the very end of a validation.
 
     Args:
-        average: callback that has exchanged them for their average.
+        average: callback that put the average into the model before the validation.
     """
 
     def __init__(self, average: AverageWeights) -> None:

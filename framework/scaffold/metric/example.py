@@ -1,4 +1,4 @@
-"""Metric example: the largest error among all samples."""
+"""Example of a metric: the mean of the largest error of each sample."""
 
 from typing import ClassVar, Literal
 
@@ -10,7 +10,7 @@ from framework.target import Target
 
 
 class Example(Mean):
-    """Mean over samples of the largest absolute error of a sample's numbers, in the unit of the target.
+    """Mean over samples of the largest absolute error among a sample's numbers, in the unit of the target.
 
     The metric evaluates the point prediction. It also returns the standard error of this mean.
 

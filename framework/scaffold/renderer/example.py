@@ -29,7 +29,7 @@ class Example(Renderer):
         """Draw the requested channels.
 
         Raises:
-            ValueError: a channel is unknown, or a face has an index of no vertex.
+            ValueError: a channel is unknown, or a face refers to a vertex that does not exist.
         """
         _require(scene, channels, self.channels)
         if not channels:
