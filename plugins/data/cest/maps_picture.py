@@ -29,8 +29,9 @@ def maps_figure(methods: Mapping[str, Maps], title: str) -> Figure:
     """Return a figure: two rows for each method, predictions and standard deviations, in % of the unsaturated signal.
 
     `methods` holds the maps of each method by its name. Amplitudes use the rainbow colours that are usual in the field,
-    the asymmetry a scale centred on 0, and standard deviations a sequential scale. The maps in a column share one
-    scale, from the 1 % to the 99 % quantile of the first method's map.
+    the asymmetry uses a scale centred on 0, and standard deviations use a sequential scale that begins at 0. In a
+    column, the predictions of all methods share one scale, and so do the standard deviations. The 1 % and 99 %
+    quantiles of the first method's map determine the scale.
     """
     columns = list(next(iter(methods.values())))
     figure = titled_figure((SIZE * len(columns) + 0.8, (SIZE + 0.35) * 2 * len(methods) + 0.4), title, False)

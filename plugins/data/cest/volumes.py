@@ -23,7 +23,10 @@ UNSATURATED = 100.0
 Images at such offsets, and at larger ones, are M0. All other images are divided by M0.
 """
 PLAUSIBLE = 2.0
-"""Upper limit of a plausible Z, which is about 1 at most; a volume with larger numbers was not divided by M0."""
+"""Limit of the median over voxels of the largest Z of a spectrum.
+
+Z is about 1 at most, so a volume above this limit was not divided by M0.
+"""
 LAYOUT = (
     "A volume holds `spectra` (or `rawData`), with the axes of the voxels first and the offsets last, and `offsets` in "
     "ppm. It may also hold `M0` (or images at 100 ppm or more) and `mask`, with the axes of the voxels."

@@ -27,10 +27,11 @@ GROUPS = ("unique", "look-alikes")
 class COIL20(Data):
     """Columbia Object Image Library: 20 objects seen every 5° of a turntable (Nene, Nayar & Murase 1996).
 
-    The views at multiples of `every` degrees are for training, the views halfway between two training views for
-    validation, and all others for the test; the model must therefore interpolate between views. With `interpolate`,
-    training batches show the objects at random angles, interpolated by the objects' appearance manifolds: periodic
-    cubic splines through the training views (Murase & Nayar 1995).
+    The views at multiples of `every` degrees are for training. Between two neighbouring training views, the view in the
+    middle (or just before the middle) is for validation, and all others are for the test. The model must therefore
+    interpolate between views. With `interpolate`, training batches show the objects at random angles. These images are
+    interpolated by the objects' appearance manifolds, which are periodic cubic splines through the training views
+    (Murase & Nayar 1995).
 
     Results are also reported separately for the objects that look nearly the same from two opposite sides. For these
     objects, two training views 180° apart are on average more similar than two neighbouring training views.
@@ -40,7 +41,7 @@ class COIL20(Data):
         every: Degrees between two training views.
         image_size: Side of the images, pixels.
         interpolate: Whether training batches show interpolated views.
-        jitter: Largest random shift, zoom and change of brightness and contrast in training, as a share.
+        jitter: Largest share by which training images are shifted, scaled and made brighter or darker.
     """
 
     bibtex = "nene1996coil20"

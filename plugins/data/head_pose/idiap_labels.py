@@ -20,9 +20,9 @@ from plugins.data.head_pose.archive import TRAIN_AND_TEST
 LABELS = "or_label_full.mat"
 ANGLES = ("pan", "tilt", "roll")
 UNIT_CHECK_MINIMUM = 20
-"""Number of labels that a file must exceed for its unit to be checked.
+"""Number of labels above which a file of degrees is refused if all its angles lie within ±2π.
 
-If all angles of such a file lie within ±2π, they are assumed to be radians.
+Such angles are probably radians.
 """
 MOST_LABELS, MOST_VALUES = 2**20, 2**12
 """Largest number of labels of a split, and largest number of letters of a name."""

@@ -54,7 +54,7 @@ class Person:
         axes: Half width, half height and half depth of the skull.
         face_tilt: Angle below the horizontal at which the middle of the opening in the hair lies, radians; the face
             shows through this opening.
-        face_reach: Cosine of the angular radius of the opening; -1 for a person without hair.
+        face_reach: Cosine of the angular radius of the opening; -1 for a bald head without a hat.
         long_hair, bun, hat: Whether the person has long hair, a bun or a hat.
         glasses, beard: Darkness of the glasses and of the beard, 0…1; 0: none.
         ears: Relative size of the ears; 0 if hair hides them.

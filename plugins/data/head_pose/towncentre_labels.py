@@ -44,7 +44,7 @@ class HeadLabels(NamedTuple):
 
 
 def find_heads(root: Path) -> HeadLabels:
-    """Return all heads in a root, in the order of their names.
+    """Return the labels of all heads in a root, sorted by folder and name.
 
     Raises:
         DataError: The root holds no folder with label files.
@@ -94,7 +94,7 @@ def read_label(file: Path) -> tuple[float, bool]:
 
 
 def _find_image(folder: Path, label: str, images: Sequence[str]) -> Path:
-    """Return the image whose name begins with the stem of the label file and does not go on with a digit.
+    """Return the image whose name begins with the stem of the label file, not followed by a digit.
 
     Raises:
         DataError: No image or more than one image has such a name.

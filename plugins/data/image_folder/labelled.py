@@ -107,7 +107,8 @@ class LabelledImages:
         """Return the chosen images of a folder, of at least `fewest` classes, with their classes and splits.
 
         Raises:
-            DataError: The table or an idx file is missing or damaged; or a class is unknown.
+            DataError: The table or an idx file is missing or damaged, the folder has another layout, a class is
+                unknown, or there are fewer classes than `fewest`.
         """
         check_shares(self.validation, self.test)
         if self.csv is not None:
@@ -150,7 +151,7 @@ class LabelledImages:
         )
 
     def load(self, root: Path, make_fields: MakeFields, fewest: int) -> Loaded:
-        """Read the images.
+        """Read the images and return them in three splits.
 
         Args:
             root: Folder of the images.

@@ -63,9 +63,9 @@ class PoseFromImage(Data):
 
     An input is (4, height, width): the linear RGB of each pixel, black beyond the body, and the share of the pixel that
     the body covers. Targets are the parameters of a `ParametricBody`; 0 is the nominal position, pose and shape. A
-    sample is a function of (`data_seed`, split, number), drawn when it is fetched. Batches also hold the image as
-    "color" (batch, height, width, 3), and "mask" (batch, height, width), bool, true for pixels that the body covers by
-    half or more.
+    sample depends only on the settings, its split and its number in the split; its image is rendered when it is
+    fetched. Batches also hold the image as "color" (batch, height, width, 3), and "mask" (batch, height, width), bool,
+    true for pixels that the body covers by half or more.
 
     Args:
         renderer: draws the images.

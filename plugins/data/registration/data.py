@@ -47,8 +47,8 @@ class Registration(Bodies):
     """Synthetic scans of people of random shape and pose; the target is every vertex of the body (thesis §6.5.2).
 
     A random adult is sampled (`framework.bodies.people`), posed by linear blend skinning, and scanned by a simulated
-    scanner (`plugins.data.registration.scanner`). Nothing is stored: a sample is a function of (`data_seed`, split,
-    number), computed when it is fetched.
+    scanner (`plugins.data.registration.scanner`). No scan is stored: a sample depends only on the settings, its split
+    and its number in the split, and is computed when it is fetched.
 
     Args:
         sizes: numbers of bodies of the splits.

@@ -196,7 +196,7 @@ def _read(file: Path, dtype: type) -> Tensor:
     """Return a generated array.
 
     Raises:
-        DataError: the file is missing or damaged.
+        DataError: the file is missing or damaged, or holds numbers of another type.
     """
     remedy = f"Delete the folder {file.parent}; its data are then generated again."
     with translate_errors(file, "an array of generated data", remedy):

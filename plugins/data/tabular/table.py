@@ -41,7 +41,10 @@ WordColumns = Literal["leave_out", "levels"]
 SPLITS = Splits._fields
 SPLIT, GROUP = "split", "group"
 MANY_LABELS = 20
-"""Largest number of different numeric labels that are accepted as classes if most of them occur in one row only."""
+"""Number of different numeric labels that are always accepted as classes.
+
+More are refused if some of them are fractions, or if they are more than half of the number of rows.
+"""
 
 
 class Question(NamedTuple):
