@@ -77,9 +77,10 @@ class BernoulliImageHead(DensityHead):
         self.factor.fill_(math.exp((low + high) / 2))
 
     def _slope(self, raws: Tensor, target: Tensor, factor: float) -> float:
-        """Return the derivative of the log-likelihood in the factor f of the log-odds r: Σ r (y - σ(f r)).
+        """Return the derivative of the log-likelihood with respect to the factor f of the log-odds: Σ r (y - σ(f r)).
 
-        y are the numbers in `target`, and σ is the logistic function. The sum is computed image by image.
+        The sum is over all numbers y in `target`, with their log-odds r before calibration; σ is the logistic function.
+        It is computed image by image.
         """
         total = 0.0
         for raw, value in zip(raws, target, strict=True):

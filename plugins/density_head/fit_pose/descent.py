@@ -58,7 +58,7 @@ AGAIN_FROM = 2
 AFRESH = 6
 """Number of successful steps after which the Hessian approximation is computed anew from the optical flow."""
 DAMPING, LEAST = 0.01, 1e-3
-"""Damping of the Hessian approximation: this share of its diagonal plus this constant is added to the diagonal."""
+"""Damping of the Hessian approximation: DAMPING times its diagonal, plus LEAST, is added to its diagonal."""
 LONGEST = (0.2, 0.08)
 """Longest step of a rotation (radians) and of a translation (metres).
 
@@ -80,7 +80,7 @@ class Descent:
         steps: largest number of steps of a stage.
         restarts: largest number of restarts from other poses while the rendered and the given image differ by more than
             `enough`.
-        enough: root mean square difference of colours at which no restart is needed.
+        enough: root mean square difference of colours up to which no restart is needed.
     """
 
     def __init__(
@@ -101,10 +101,10 @@ class Descent:
         )
 
     def __call__(self, picture: Float[Tensor, "height width 4"]) -> BodyFit:
-        """Return the fit with the smallest difference of images among the first descent and its restarts.
+        """Return the fit whose rendered image differs least from `picture`, among the first descent and its restarts.
 
         The channels of `picture` are linear RGB on black, and the share of each pixel that the body covers. The
-        restarts are random but always the same, so that the fit depends only on the image.
+        starting poses of the restarts are drawn with a fixed seed, so that the fit depends only on the image.
         """
         began = time.process_time()
         random = torch.Generator().manual_seed(0)

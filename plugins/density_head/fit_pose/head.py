@@ -25,7 +25,7 @@ FLOOR, WIDEST = 1e-5, 1e9
 SLACK = 1e-3
 """Largest distance of an image's values from the range [0, 1] that is accepted as rounding error."""
 NEEDED = frozenset(("vertices",))
-"""Parts of a scene (`Renderer.differentiable`) by which the renderer must be differentiable."""
+"""Parts of a scene with respect to which the rendered image must be differentiable (`Renderer.differentiable`)."""
 
 
 class FitPoseHead(DensityHead, Fitted):

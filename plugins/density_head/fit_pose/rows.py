@@ -1,4 +1,4 @@
-"""Contract-test cases: the pose of a doll."""
+"""Contract-test cases: the pose of the small body model `framework.testing.bodies.doll`."""
 
 from framework.bodies.parametric import parametric_body
 from framework.target import Target

@@ -1,4 +1,4 @@
-"""Physics as a density head: estimates the state of a ball, computes its flight, and gives the uncertainty of both."""
+"""Density head of a ball's flight: it estimates the state of the ball and integrates the equation of motion."""
 
 import math
 from collections.abc import Mapping
@@ -63,7 +63,7 @@ class BallisticHead(DensityHead, Fitted):
     Args:
         observed, step: number of observed frames, and time between frames in seconds; the same values as in the config
             of the data.
-        density: method by which the state's uncertainty is propagated.
+        density: method by which the state's uncertainty is propagated, "linearised" or "sampled".
         samples: number of sampled flights in the mixture; may be set at any time.
         spin: prior standard deviation of each component of the spin, rad/s.
         noise: standard deviation of the measurement error of each coordinate, m; initial value of `fit`.

@@ -44,7 +44,7 @@ def fitted_constants(constants: Constants) -> Float[Tensor, "constant"]:
 
 
 def constant_bounds(constants: Constants) -> tuple[Float[Tensor, "constant"], Float[Tensor, "constant"]]:
-    """Return lower and upper bounds that stored values of `FITTED` must satisfy.
+    """Return lower and upper bounds of the constants in `FITTED`, which the values in a stored head must satisfy.
 
     They are the bounds of `identify`, extended to the values of the config (`constants`) if these lie outside. The
     height of the table may be any height at which flights bounce.

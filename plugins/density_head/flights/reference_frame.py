@@ -11,7 +11,7 @@ from framework.flights.estimation import ObservedFrames
 from framework.flights.physics import Constants
 
 FEWEST = 5
-"""Smallest number of pieces of flights, or of bounces, from which something is concluded."""
+"""Smallest number of bounces, or of pieces of flights, with which `require_frame` checks the frame of reference."""
 PIECE = 12
 """Number of frames of a piece of a flight."""
 FALL = (5.0, 20.0)
@@ -69,10 +69,12 @@ def bounces(observations: ObservedFrames) -> Float[Tensor, "bounce 3"]:
 
 
 def require_frame(observations: ObservedFrames, constants: Constants, by: str) -> Constants:
-    """Return the constants, with the height of the table at which the flights bounce.
+    """Check the frame of reference of flights, and return the constants with the height of the table in this frame.
 
-    Nothing is concluded from fewer than five pieces of flights (PIECE frames each) or five bounces, from flights that
-    are not those of a falling ball, or from bounces at different heights.
+    The vertical axis is checked if there are at least five pieces of flights (of PIECE frames each), and if the size of
+    their median acceleration is that of a falling ball. The table is checked, and its height set, if there are at least
+    five bounces at nearly equal heights. Otherwise, or if this height is within NEAR_HEIGHT of that in the constants,
+    the constants are returned unchanged.
 
     Args:
         observations: whole flights.

@@ -1,4 +1,4 @@
-"""A density around a mean that an encoder gives, such as a physical model; a network predicts its shape."""
+"""A density around a mean that an encoder computes, for example by physics; a network predicts the density's shape."""
 
 from typing import Annotated
 

@@ -1,1 +1,1 @@
-"""Density of rotations by a network of features and rotation, normalised on a grid (Murphy et al. 2021)."""
+"""Density of rotations from a network that reads features and a rotation, normalised on a grid (Murphy et al. 2021)."""

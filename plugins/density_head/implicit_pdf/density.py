@@ -18,7 +18,7 @@ from framework.heads.viewpoints import CHART, VOLUME, UniformViewpoints, Viewpoi
 BINS = 360
 """Number of bins of the density of a single angle."""
 FEW = 4608
-"""Largest number of cells for which a matrix holds the share of each cell in each arc."""
+"""Largest number of cells for which a matrix holds the share of each cell that lies in each arc (`_shares`)."""
 POINTS = 2**20
 """Number of points in all cells together from which the density of a single angle is computed.
 
@@ -130,7 +130,10 @@ class AngleDensity(PlainDensity):
 
 
 def _arc(angle: Tensor, half: bool) -> Tensor:
-    """Return the number of the arc of each angle; elevations outside ±π/2 are read as those of the same rotation."""
+    """Return the index of the arc in which each angle lies.
+
+    `half` is true for elevations. An elevation outside ±π/2 is replaced by that of the same rotation within ±π/2.
+    """
     angle = wrap(angle.double())
     low, length = -math.pi, 2 * math.pi
     if half:
@@ -141,8 +144,9 @@ def _arc(angle: Tensor, half: bool) -> Tensor:
 
 @cache
 def _arcs(cells: int, index: int) -> Int[Tensor, "point cell"]:
-    """Return the arc of one angle at several points of each cell.
+    """Return the index of the arc of one angle at several points of each cell.
 
+    `cells` is the number of cells, and `index` the position of the angle in the viewpoint (azimuth, elevation, tilt).
     The points of all cells together are one sequence of low discrepancy: multiples of the powers of the root g of g⁴ =
     g + 1, modulo 1 (a Kronecker sequence; Niederreiter 1992, §3.1).
     """
@@ -158,7 +162,10 @@ def _arcs(cells: int, index: int) -> Int[Tensor, "point cell"]:
 
 @cache
 def _shares(cells: int, index: int) -> Float[Tensor, "cell arc"]:
-    """Return the share of each cell that lies in each arc, for a grid of few cells."""
+    """Return the share of each cell that lies in each arc of one angle, for a grid of few cells.
+
+    `cells` is the number of cells, and `index` the position of the angle in the viewpoint (azimuth, elevation, tilt).
+    """
     arcs = _arcs(cells, index).long()
     place = torch.arange(cells) * BINS + arcs
     count = torch.bincount(place.flatten(), minlength=cells * BINS)

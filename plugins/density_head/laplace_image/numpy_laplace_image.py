@@ -1,4 +1,4 @@
-"""Laplace densities of the numbers of an image of an exported model, computed with NumPy alone."""
+"""Laplace densities of the numbers of an image, for exported models, computed with NumPy alone."""
 
 import math
 

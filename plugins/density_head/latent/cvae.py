@@ -95,7 +95,7 @@ class Networks(Latent):
         return torch.cat([self.decode(part) for part in z.split(self.at_once(len(z)))]).movedim(0, -2)
 
     def log_weights(self, value: Tensor, items: Tensor, noise: Tensor) -> Tensor:
-        """Return the log of the importance weights of z that are drawn from q(z|x,φ), nats (thesis eq. 3.19).
+        """Return the log of the importance weights of z drawn from the encoder q(z|x,φ), nats (thesis eq. 3.19).
 
         `value` are targets φ, (row, *event), and `items` the index of each row's item in the flattened batch. `noise`
         holds the standard normal numbers from which z is computed, (*draw, row, latent).

@@ -145,9 +145,9 @@ def estimate_from_sums(
 
     Let m_r be the mean weight of replicate r divided by the mean weight of all R replicates. The squared relative
     standard error of the mean weight is s² = Σ (m_r - 1)² / (R (R - 1)), and s is also the standard error of its
-    logarithm (delta method). The expectation of the logarithm is too small by s²/2, which `debiased` adds. A jackknife
-    over replicates removes the same term, but is infinite if one replicate has all the weight; s² is at most 1, and
-    the correction at most 1/2.
+    logarithm (delta method). The expectation of the logarithm is too small by s²/2; the field `debiased` of the result
+    has this correction. A jackknife over replicates removes the same term, but is infinite if one replicate has all the
+    weight. In contrast, s² is at most 1, and the correction at most 1/2.
 
     The share of a point is its standard normal density divided by the density from which it was drawn (`stretch`), and
     has the expectation 1. If shares are given, the estimate is the ratio of the mean weight to the mean share, which

@@ -1,4 +1,4 @@
-"""Contract-test cases: CVAEs, with log-densities computed sample by sample in NumPy."""
+"""Contract-test cases: CVAEs and simplified CVAEs, with log-densities computed sample by sample in NumPy."""
 
 import math
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Matrix Fisher densities of viewpoints of an exported model, computed with NumPy alone."""
+"""Matrix Fisher densities of viewpoints, for exported models, computed with NumPy alone."""
 
 import math
 
@@ -48,7 +48,7 @@ class MatrixFisher(Density):
         return volume - (self.falls * turn[..., 1:] ** 2).sum(-1) - self._log_constant()
 
     def _log_constant(self) -> Array:
-        """Return log(c(F) exp(-tr S)), (*batch)."""
+        """Return log(c(F) exp(-tr S)), (*batch), where S is the diagonal matrix of the proper singular values of F."""
         first, second, third = (self.falls[..., index, None] for index in range(3))
         end = _REACH / np.maximum(second, _REACH)
         stretch = (third - second) / 2

@@ -41,7 +41,8 @@ RAWS = {
 def exact(raw: np.ndarray, value: np.ndarray) -> float:
     """Return log p(a, e, t) = tr(FᵀR) - log c(F) + log(|cos e| / 8π²), nats.
 
-    All terms are computed with 60 digits, except for c(F) exp(-tr S), which has 15.
+    a, e and t are the angles in `value`, R is their rotation, and F the parameter for `raw`. All terms are computed
+    with 60 digits, except for the factor c(F) exp(-tr S) of `log_constant`, which has 15.
     """
     with mpmath.workdps(60):
         parameter = _parameter(raw)
@@ -56,9 +57,10 @@ def exact(raw: np.ndarray, value: np.ndarray) -> float:
 
 
 def log_constant(first: float, second: float, third: float) -> float:
-    """Return log(c(F) exp(-tr S)) for the falls λ₁, λ₂, λ₃, by the integral of Lee 2018, eq. 12, with u = 1 - 2w.
+    """Return log(c(F) exp(-tr S)), with the normaliser c(F), by the integral of Lee 2018, eq. 12, with u = 1 - 2w.
 
-    The falls are those of `framework.geometry.aligned_rotations`, and S holds the proper singular values of F.
+    S = diag(s₁, s₂, s₃) holds the proper singular values of F. The arguments are λ₁ = 2(s₂+s₃), λ₂ = 2(s₁+s₃) and λ₃ =
+    2(s₁+s₂), which `framework.geometry.aligned_rotations` calls falls.
 
     The integral is computed by Gauss-Legendre quadrature on panels that become shorter towards both ends, by a factor
     of ten for every two panels. The components of the quaternion are paired as (q₀, q₃) and (q₁, q₂), unlike in the

@@ -16,8 +16,8 @@ class PiecewiseQuantiles(PlainDensity):
 
     Between the quantiles q_k and q_(k+1) of the probabilities τ_k and τ_(k+1) the density is uniform with the
     probability τ_(k+1) - τ_k (Gasthaus et al. 2019, with knots at the quantiles). Beyond the outermost quantiles it is
-    a generalised Pareto density (Ehrlich, Callot & Aubet 2021) with the shape ξ, which begins as high as in the
-    adjacent interval: p = (1 - τ_K)/b · (1 + ξ d)^(-1 - 1/ξ) for d = (y - q_K)/b and b = (1 - τ_K) (q_K -
+    a generalised Pareto density (Ehrlich, Callot & Aubet 2021) with the shape ξ, which is continuous with the density
+    of the adjacent interval: p = (1 - τ_K)/b · (1 + ξ d)^(-1 - 1/ξ) for d = (y - q_K)/b and b = (1 - τ_K) (q_K -
     q_(K-1))/(τ_K - τ_(K-1)), and likewise below q_1. For ξ = 0 the tails are exponential.
 
     Args:
@@ -68,7 +68,7 @@ class PiecewiseQuantiles(PlainDensity):
 
     @cached_property
     def _tail_scales(self) -> tuple[Tensor, Tensor]:
-        """Scales b of the lower and of the upper tail, (*batch,)."""
+        """Scales b of the Pareto densities of the lower and of the upper tail, (*batch,) each."""
         heights = self._log_heights
         lower = self.probabilities[0] * torch.exp(-heights[..., 0])
         return lower, (1 - self.probabilities[-1]) * torch.exp(-heights[..., -1])
@@ -90,7 +90,10 @@ class PiecewiseQuantiles(PlainDensity):
         return torch.where((piece == 0) | (piece == last), tails, inner)
 
     def _fall(self, distance: Tensor) -> Tensor:
-        """Return by how much the log-density of a tail falls from its beginning to `distance` (unit: its scale)."""
+        """Return a tail's log-density at its beginning minus its log-density at `distance` from there, nats.
+
+        `distance` is in units of the tail's scale b.
+        """
         if self.tail == 0:
             return distance
         return (1 + 1 / self.tail) * torch.log1p(self.tail * distance)
@@ -113,7 +116,10 @@ class PiecewiseQuantiles(PlainDensity):
         return torch.where(piece == 0, below, torch.where(piece == last, 1 - above, inner))
 
     def _survival(self, distance: Tensor) -> Tensor:
-        """Return the share of a tail that lies beyond `distance` from its beginning (unit: its scale)."""
+        """Return the share of a tail's probability that lies farther than `distance` from its beginning.
+
+        `distance` is in units of the tail's scale b.
+        """
         if self.tail == 0:
             return torch.exp(-distance)
         return torch.exp(-torch.log1p(self.tail * distance) / self.tail)

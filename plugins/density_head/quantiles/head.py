@@ -30,11 +30,11 @@ class QuantilesHead(DensityHead):
 
     The loss is the mean pinball loss of all quantiles times 2, in standard deviations of the target. With many levels
     it approaches the continuous ranked probability score (Gneiting & Raftery 2007). The quantiles cannot cross: the raw
-    parameters are the middle quantile and the distances to the next ones. `calibrate` moves each quantile, so
-    that at least the stated share of the validation split lies below it (conformalised quantile regression, Romano,
-    Patterson & Candès 2019, for each quantile). The distance by which a quantile is moved is a share of the distance
-    from the lowest to the highest quantile; this share is the same for all samples. The moved quantiles are sorted
-    (Chernozhukov, Fernández-Val & Galichon 2010).
+    parameters are the middle quantile and the distances between neighbouring quantiles. `calibrate` moves each
+    quantile, so that at least the stated share of the validation split lies at or below it (conformalised quantile
+    regression, Romano, Patterson & Candès 2019, for each quantile). The distance by which a quantile is moved is a
+    share of the distance from the lowest to the highest quantile; this share is the same for all samples. The moved
+    quantiles are sorted (Chernozhukov, Fernández-Val & Galichon 2010).
 
     Args:
         levels: number of quantiles K, odd; their probabilities are k/(K + 1).

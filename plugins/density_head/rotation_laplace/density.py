@@ -66,7 +66,8 @@ def _(density: RotationLaplace) -> UniformViewpoints:
 def _(density: RotationLaplace, index: int) -> Angle:
     """Return the marginal density of one angle.
 
-    The density of rotations is a mixture over s, whose components have the falls s·λ (`functions`).
+    The density of rotations is a mixture over s > 0 of densities proportional to exp(-s Σ λᵢqᵢ²); functions.py explains
+    s, λ and q. The result is the mixture of the marginal densities of these components.
     """
     frame = density.frame
     scale, log_mass = functions.log_node_weights(frame.falls)

@@ -1,18 +1,19 @@
 """The rotation Laplace density p(R) = exp(-d) / (d F(A)) with d² = tr(S - AᵀR) + δ² (Yin et al. 2023, Def. 3).
 
 A = U S Vᵀ is the proper singular value decomposition, and F(A) is the normaliser. q is the quaternion of UᵀRV, called
-aligned because it is 1 at the mode. With λ, the falls of `framework.geometry.aligned_rotations` (2(s₂+s₃), 2(s₁+s₃),
-2(s₁+s₂) for the singular values s), tr(S - AᵀR) = u = Σ λᵢqᵢ². The density of the paper has δ = 0 and is infinite at
-the mode. With δ = SOFTENING, the density is finite, and differs from the paper's density only for u of the order of δ².
+aligned because it is 1 at the mode. For S = diag(σ₁, σ₂, σ₃), let λ₁ = 2(σ₂+σ₃), λ₂ = 2(σ₁+σ₃) and λ₃ = 2(σ₁+σ₂); they
+are called `falls`, as in `framework.geometry.aligned_rotations`. Then tr(S - AᵀR) = u = Σ λᵢqᵢ². The density of the
+paper has δ = 0 and is infinite at the mode. With δ = SOFTENING, the density is finite, and differs from the paper's
+density only for u of the order of δ².
 
 **The normaliser.** For d > 0 (Gradshteyn & Ryzhik 2007, 3.471.15)
 
     exp(-d) / d = ∫₀^∞ exp(-s d² - 1/(4s)) / √(πs) ds,
 
-so that a rotation Laplace density is a mixture of the densities exp(-s Σ λᵢqᵢ²) / k(sλ) over s, and k is a single
-integral. With s = exp(τ), the integrand is analytic around the real line, and the error of the trapezium rule in τ
-falls exponentially with 1/h for the step h (Trefethen & Weideman 2014, Thm. 5.1). The tests find errors of log F below
-1e-8. Draws choose a node by its weight, and then an aligned quaternion with the falls sλ.
+so that a rotation Laplace density is a mixture over s of the densities exp(-s Σ λᵢqᵢ²) / k(sλ). Their normaliser k is a
+single integral. With s = exp(τ), the integrand is analytic around the real line, and the error of the trapezium rule in
+τ falls exponentially with 1/h for the step h (Trefethen & Weideman 2014, Thm. 5.1). The tests find errors of log F
+below 1e-8. A draw chooses a node s by its weight, and then a quaternion q from the density with sλ in place of λ.
 """
 
 import math
@@ -67,7 +68,7 @@ def log_node_weights(falls: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor]:
     F is an integral over s > 0 that depends on the parameter of the density only through λ. It is the sum of the terms.
 
     Args:
-        falls: λ, the rates at which the log-density falls along the three axes of rotation of its mode, ascending.
+        falls: λ (see the module), ascending.
 
     Returns:
         s, (node,), and the logarithm of the term of each node, (*batch, node).
@@ -78,18 +79,22 @@ def log_node_weights(falls: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor]:
 
 
 def _scales(falls: Tensor) -> tuple[Tensor, Tensor]:
-    """Return s at the nodes of the trapezium rule, and the log of the integrand's part that does not depend on λ."""
+    """Return the nodes s of the quadrature for the normaliser F, and the logarithm of each term's factor without λ.
+
+    A term of the quadrature (see the module) is this factor times k(sλ). `falls` only gives the device.
+    """
     log_scale = torch.arange(LOW, HIGH, STEP, dtype=torch.float64, device=falls.device)
     scale = log_scale.exp()
     return scale, log_scale / 2 - 1 / (4 * scale) - scale * SOFTENING**2 + math.log(STEP / math.pi**0.5)
 
 
 def _log_mean(falls: Tensor, moments: bool) -> tuple[Tensor, Tensor]:
-    """Return log k(λ), and the second moments E qᵢ² if requested, (*batch, 3).
+    """Return log k(λ), and with `moments` the second moments E qᵢ², (*batch, 3).
 
-    The integral is that of `framework.geometry.aligned_rotations`, with fewer nodes:
+    k is the normaliser of the density exp(-Σ λᵢqᵢ²) / k(λ) of a unit quaternion q. The integral is that of
+    `framework.geometry.aligned_rotations`, with fewer nodes and with the variable of integration y:
 
-        k(λ) = ∫₀¹ exp(-λ₂w) I₀ₑ((λ₃-λ₂)w/2) I₀ₑ(λ₁(1-w)/2) dw,   √w = t₀ sinh y.
+        k(λ) = ∫₀¹ exp(-λ₂w) I₀ₑ((λ₃-λ₂)w/2) I₀ₑ(λ₁(1-w)/2) dw,   √w proportional to sinh y.
     """
     first, second, third = (falls[..., index, None] for index in range(3))
     end = REACH / second.clamp(min=REACH)
@@ -118,7 +123,7 @@ def _log_mean(falls: Tensor, moments: bool) -> tuple[Tensor, Tensor]:
 
 
 class _Trace(Function):
-    """Autograd function of tr(S - AᵀR); its derivative in A is U Vᵀ - R."""
+    """Autograd function of tr(S - AᵀR) for A = U S Vᵀ; its derivative with respect to A is U Vᵀ - R."""
 
     @staticmethod
     def forward(ctx: Any, turn: Tensor, parameter: Tensor) -> Tensor:
@@ -143,8 +148,9 @@ class _Trace(Function):
 class _LogNormaliser(Function):
     """Autograd function of log F(A).
 
-    Its derivative in λᵢ is minus the mean of s E qᵢ² over the nodes, and its derivative in A is U diag(g) Vᵀ with the
-    derivatives g in the singular values.
+    Its derivative with respect to λᵢ is minus the weighted mean of s E qᵢ² over the nodes s. Its derivative with
+    respect to A = U S Vᵀ is U diag(g) Vᵀ, where g are the derivatives with respect to the singular values. The module's
+    docstring explains s, λ and q.
     """
 
     @staticmethod

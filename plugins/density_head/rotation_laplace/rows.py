@@ -62,7 +62,7 @@ def log_normaliser(falls: tuple[float, ...]) -> float:
 
 
 def cases(head: DensityHead) -> Iterator[Case]:
-    """Yield a case for every matrix of raw parameters, at a few viewpoints, two of them outside of the chart."""
+    """Yield a case for every matrix of raw parameters, at some viewpoints, two of which have elevations beyond ±π/2."""
     for name, matrix in RAWS.items():
         parameter = matrix * (1 + (matrix**2).sum() / 16) ** 1.5
         singular = np.linalg.svd(parameter, compute_uv=False)

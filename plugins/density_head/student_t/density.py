@@ -125,7 +125,10 @@ class StudentT(Symmetric):
 
 
 def _apply_scipy(name: str, freedom: Tensor, argument: Tensor) -> Tensor:
-    """Return a function of `scipy.special`, which torch lacks, with the arguments ν and `argument`, float64."""
+    """Return the value of the function `name` of `scipy.special` at the arguments ν and `argument`, float64.
+
+    ν are the degrees of freedom in `freedom`. Torch lacks these functions. The result has no gradient.
+    """
     # imported here, since importing SciPy is slow and most commands do not need it
     from scipy import special
 

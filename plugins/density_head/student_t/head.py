@@ -128,7 +128,7 @@ class StudentTHead(HeadOfReals):
     def _parts(self, raw: Float[Tensor, "*batch size"]) -> tuple[Tensor, Tensor, Tensor]:
         """Return location and scale, (*batch, number), and degrees of freedom that broadcast to them.
 
-        They are in the unit of the raw parameters, and without the numbers that `calibrate` chooses.
+        They are in the unit of the raw parameters, and do not contain the values that `calibrate` chooses.
         """
         raw = require_finite(raw, self.size)
         parts = raw.unflatten(-1, (-1, self.numbers)).unbind(-2)

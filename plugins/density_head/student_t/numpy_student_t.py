@@ -1,4 +1,4 @@
-"""Student's t densities of an exported model, computed with NumPy alone."""
+"""Student's t densities, for exported models, computed with NumPy alone."""
 
 import math
 

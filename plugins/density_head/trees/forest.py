@@ -22,7 +22,7 @@ compiled = compiler(kernel_cache("forest", [Path(__file__)]))
 def at_most(threshold: np.ndarray) -> np.ndarray:
     """Return the largest float32 that is at most each float64 in `threshold`.
 
-    A float32 feature is at most the result exactly if it is at most the threshold.
+    A float32 feature is at most the result if and only if it is at most the threshold.
     """
     rounded = threshold.astype(np.float32)
     return np.where(rounded > threshold, np.nextafter(rounded, np.float32(-np.inf)), rounded)

@@ -85,7 +85,10 @@ def _rounding_error(value: Tensor, mean: Tensor, high: Tensor) -> Tensor:
 
 
 def _reduce(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return sin(ρ/2), cos(ρ/2), and 1 where the integer n is odd or else 0, for φ-μ = nπ + ρ with the smallest |ρ|."""
+    """Return sin(ρ/2), cos(ρ/2) and a mask: 1 where n is odd, 0 where n is even.
+
+    The integer n and the rest ρ are those of φ-μ = nπ + ρ with the smallest |ρ|.
+    """
     if value.dtype == torch.float32 and mean.dtype == torch.float32:
         high = value.double() - mean.double()
         low = None

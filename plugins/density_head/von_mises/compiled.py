@@ -25,7 +25,7 @@ compiled = compiler(kernel_cache("von_mises", _SOURCES), fastmath={"contract", "
 
 
 def _intrinsic(function: Callable[..., Any]) -> Any:
-    """Return a function for compiled code from one that generates its instructions."""
+    """Return a function that compiled code can call, for a function that generates the instructions."""
     return intrinsic(no_type_check(function))
 
 
@@ -43,7 +43,10 @@ def multiply_add(typing, first, second, third):
 
 
 def _same_bits(source: Any, kind: Any) -> tuple[Any, Callable[..., Any]]:
-    """Return the signature and the code of a function that reads the bits of a `source` as a `kind`."""
+    """Return the signature and the code of a function that reads the bits of a number as another type.
+
+    `source` is numba's type of the number, and `kind` the type of the result.
+    """
 
     def generate(context: Any, builder: Any, sig: Any, values: Any) -> Any:
         return builder.bitcast(values[0], context.get_value_type(kind))

@@ -1,9 +1,10 @@
 """Generator of coefficients.npz, run with `python -m plugins.density_head.von_mises.fit_coefficients`; needs mpmath.
 
-Every function below is smooth on κ ∈ [0, ∞] as a function of v = 2/(κ+2) ∈ [0, 1]. That interval is divided into equal
-pieces, whose number is a power of two, so that v's piece and its position y ∈ [-1, 1] there are found without rounding.
-On each piece the function is interpolated at Chebyshev nodes in 60 digits and written as a polynomial in y. The errors
-of the polynomial and of its first derivative in v, from which 1 - A(κ) is computed, stay within a tolerance.
+The approximated functions (`smooth`) are smooth in v = 2/(κ+2) ∈ [0, 1], for κ ∈ [0, ∞]. The interval of v is divided
+into equal pieces, whose number is a power of two, so that v's piece and its position y ∈ [-1, 1] there are found
+without rounding. On each piece the function is interpolated at Chebyshev nodes in 60 digits and written as a polynomial
+in y. The errors of the polynomial and of its first derivative in v, from which 1 - A(κ) is computed, stay within a
+tolerance.
 """
 
 from functools import cache
@@ -99,9 +100,9 @@ def chebyshev_series(low: Real, high: Real, which: int) -> list[Real]:
 def degree(series: list[Real], pieces: Real, tolerance: Real) -> int:
     """Return the smallest degree at which a Chebyshev series on a piece of the length 1 / `pieces` may be cut.
 
-    The series approximates the function G(v) of the module's docstring. The terms that are cut must add up to less than
-    the tolerance, and their derivatives in v to less than four times the tolerance. The second bound limits the error
-    of the mean resultant length A(κ), which is computed from the derivative of G: 1 - A(κ) = v/4 + v² G'(v)/2.
+    The terms that are cut must add up to less than the tolerance, and their derivatives with respect to v to less than
+    four times the tolerance. The second bound is needed for the function G(v) = "log_peak" of `smooth`: from its
+    derivative the mean resultant length A(κ) is computed, by 1 - A(κ) = v/4 + v² G'(v)/2.
     """
     return next(
         d

@@ -31,9 +31,9 @@ At least 65.7 % of proposals are accepted, so that fewer than one sample in 10^2
 def log_prob(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
     """Return the log-density, nats, with accurate first and second derivatives in all three arguments.
 
-    The difference φ-μ is not rounded. float32 angles of any size are read modulo 2π exactly (compiled: up to 4e8
-    radians). float64 angles are read exactly up to 4e8 radians; larger ones have an error of one unit of their last
-    digit. Arguments in half precision are computed in float32.
+    The difference φ-μ is not rounded. float32 angles of any size are read modulo 2π exactly (under torch.compile and
+    torch.func only up to 4e8 radians). float64 angles are read exactly up to 4e8 radians; larger ones have an error of
+    one unit of their last digit. Arguments in half precision are computed in float32.
     """
     dtype = torch.promote_types(torch.promote_types(value.dtype, mean.dtype), concentration.dtype)
     if dtype.itemsize < 4:

@@ -26,7 +26,7 @@ unpredictable could not be learned later.
 
 
 class VonMisesHead(DensityHead):
-    """One von Mises density per angle: biternion mean, predicted or one global concentration (thesis §3.4).
+    """One von Mises density per angle, with a concentration that is predicted or common to all inputs (thesis §3.4).
 
     With `concentration="predicted"` the head reads (cos, sin, r) per angle and trains by likelihood (eq. 3.7), with κ =
     |(cos, sin)| g(r). The scale g(r) stays above a quarter. The pair (cos, sin) times g(r) is the density's natural

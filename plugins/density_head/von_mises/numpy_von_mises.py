@@ -1,4 +1,4 @@
-"""Von Mises densities of an exported model, computed with NumPy alone."""
+"""Von Mises densities, for exported models, computed with NumPy alone."""
 
 import math
 from functools import cached_property
@@ -79,7 +79,10 @@ class VonMises(Density):
 
 
 def _below(concentration: Array, angle: Array) -> Array:
-    """Return the probability from the mean to `angle` in [-π, 3π), with the sign of the angle."""
+    """Return the probability of the arc from the mean to `angle`, negative for a negative angle.
+
+    `angle` is the distance from the mean, in [-π, 3π); a full rotation has the probability 1.
+    """
     turns = np.floor((angle + math.pi) / (2 * math.pi))
     angle = angle - 2 * math.pi * turns
     concentration = np.broadcast_to(concentration, angle.shape)

@@ -117,8 +117,8 @@ def _in_ball(lattice: Callable[[int], np.ndarray], cell: float, count: int) -> n
         count: number of points in the ball.
 
     Raises:
-        ConfigError: no tried centre of the ball allows exactly `count` points, because the point number `count` in
-            order of distance from the centre and the next point are equally far from it, up to rounding.
+        ConfigError: for none of the centres that are tried do exactly `count` points lie in the ball, because the next
+            point is as far from the centre as the last one of them, up to rounding.
     """
     radius = (3 * count * cell / (4 * math.pi)) ** (
         1 / 3

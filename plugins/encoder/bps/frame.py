@@ -82,9 +82,10 @@ def frame(coordinates: Float[Tensor, "batch points 3"], reach: float = 1.0) -> F
 
 
 class Axes(torch.autograd.Function):
-    """Differentiable function that returns the eigenvalues and eigenvectors that it is given.
+    """Autograd function that makes given eigenvalues and eigenvectors differentiable with respect to their matrix.
 
-    They belong to the matrix of second moments, `second`, and are differentiable with respect to this matrix.
+    The matrix is that of the second moments, `second`. The forward pass returns the eigenvalues `values` and the
+    eigenvectors `axes` unchanged.
 
     The backward pass uses only the outputs of the forward pass, so that it can itself be differentiated. The
     derivatives of torch.linalg.eigh are not finite where two eigenvalues are equal.
@@ -103,7 +104,7 @@ class Axes(torch.autograd.Function):
     def backward(  # type: ignore[override]
         ctx: Any, values_gradient: Tensor, axes_gradient: Tensor
     ) -> tuple[Tensor, None, None]:
-        """Return the gradient with respect to the matrix, and None for the eigenvalues and eigenvectors."""
+        """Return the gradient with respect to the matrix `second`, and None for the arguments `values` and `axes`."""
         values, axes = ctx.saved_tensors
         # first-order perturbation: d value_j = axis_jᵀ d(second) axis_j, and
         # d axis_j = Σ_i axis_i (axis_iᵀ d(second) axis_j) / (value_j - value_i)

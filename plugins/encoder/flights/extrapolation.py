@@ -35,7 +35,9 @@ class ExtrapolationEncoder(Encoder):
     """Extrapolated positions of the ball on a robust parabola through its last frames.
 
     Features: x, y and z on the parabola at each future frame, m; the logarithms of the units in which a density head
-    expresses how far the ball is from these positions; and the observed frames, relative to the parabola.
+    expresses how far the ball is from these positions; the coefficients of the parabolas through the longest span of
+    frames that a parabola fits and through the shortest one, the index of the first of these spans, and logarithms of
+    the variance of its parabola; and the observed frames, relative to the parabola.
 
     Each coordinate is a parabola in time. It is fitted to the last frames by least squares with Cauchy's weights, so
     that an outlier has little influence. Drag, spin, table and bounce are not modelled. Nothing is learnt.

@@ -45,7 +45,7 @@ class CellEncoder(Encoder):
 
     @abstractmethod
     def encode(self, clouds: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch cells"]:
-        """Return the numbers of the cells for normalised clouds, in the order in which x changes slowest."""
+        """Return one number for each cell, for normalised clouds; x changes slowest in the order of the cells."""
 
     def forward(
         self, inputs: Float[Tensor, "batch points columns"]

@@ -56,8 +56,8 @@ class VoxNet(Encoder):
             published ones.
         dropout: probabilities: three in "voxnet", one for each fully connected layer in "conv3d". None for the
             published ones.
-        padding: number of cells with zeros around the grid that 3 × 3 × 3 convolutions read; with 1 the side stays the
-            same.
+        padding: width, in cells, of the border of zeros around the input of each 3 × 3 × 3 convolution; with 1, its
+            output has as many cells along each edge as its input.
 
     Raises:
         ConfigError: the input is not a cubic grid, or is too small, or `dropout` has the wrong length.

@@ -1,4 +1,4 @@
-"""Normal scores: each number by its rank among the training samples, through the normal quantile function."""
+"""Normal scores of numbers: the normal quantiles of their ranks among the training samples."""
 
 import torch
 from jaxtyping import Float
@@ -8,7 +8,7 @@ from framework.encoder import Encoder, FitsInputs, require_numbers
 from framework.storage.weights import require_state
 
 KNOTS = 128
-"""Largest number of stored values of an input number; scores are stored for these values and interpolated between."""
+"""Largest number of stored values of an input number; between these values the scores are interpolated."""
 WIDEST = 8.0
 """Bound of the scores, which no rank of float64 exceeds."""
 
@@ -59,7 +59,7 @@ class NormalScores(Encoder, FitsInputs):
 
     @torch.no_grad()
     def fit_inputs(self, inputs: Float[Tensor, "sample *input"]) -> None:
-        """Set the values at which scores are known, and these scores, from the training samples."""
+        """Compute the stored values of each number, and their scores, from the training samples."""
         for number, column in enumerate(inputs.flatten(1).double().T):
             values, scores = fit_scores(column)
             # a shorter list is filled with its last value, so that the pieces behind it have the length 0

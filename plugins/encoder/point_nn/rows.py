@@ -1,4 +1,4 @@
-"""Contract-test cases: fewer, as many and more points than a cloud has."""
+"""Contract-test cases: all or half of the points of a cloud, and more stages than the cloud has points."""
 
 from framework.testing.rows import CloudRow
 

@@ -1,1 +1,1 @@
-"""Networks that read point sets: PointNet, PointNet++ and DeepSets."""
+"""Networks that read point sets: PointNet, PointNet++, DeepSets and DGCNN."""

@@ -123,5 +123,8 @@ def edge_convolution(
 
 
 def _over_neighbours(values: Float[Tensor, "point neighbours channels"]) -> Float[Tensor, "point channels"]:
-    """Return the maximum over the neighbours: `max` has the faster gradient, `amax` the faster value."""
+    """Return the maximum over the neighbours.
+
+    It is computed by `max` if a gradient is needed, and otherwise by `amax`, whose forward pass is faster.
+    """
     return values.max(1).values if values.requires_grad else values.amax(1)

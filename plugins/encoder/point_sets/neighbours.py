@@ -26,8 +26,9 @@ def nearest_rows(
     Args:
         values: points of all clouds, concatenated.
         counts: number of points of each cloud.
-        neighbours: number of rows for each point; in a cloud with fewer points, all of them, and the point's own row
-            repeated. The result has fewer columns if no cloud has so many points.
+        neighbours: number of nearest points of each point, which include the point itself. In a cloud with fewer
+            points, the rows of all its points are returned, and the point's own row is repeated. If every cloud has
+            fewer points, the result has as many columns as the largest cloud has points.
 
     Raises:
         ConfigError: the network is exported.

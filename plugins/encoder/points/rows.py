@@ -1,4 +1,4 @@
-"""Contract-test cases: fewer and more points than the cloud has, both choices."""
+"""Contract-test cases: fewer points than the cloud has, as many, and more, with both choices."""
 
 from framework.testing.rows import CloudRow
 

@@ -136,7 +136,7 @@ def splat(image, nearest, span, focal, thick, around, close, weights, filled):
         thick: thickness of a surface, in widths of a pixel at the surface's depth.
         around: (offsets, 2), row and column of each offset in the disc of a splat, row by row.
         close: (offsets, 2), row and column of each offset in the disc that closes holes, row by row.
-        weights: weight of a point, indexed by its squared distance and the squared distance of the nearest point.
+        weights: table of the weights of points, as `splats.weights` returns it.
         filled: image of the surface, (5, height, width).
     """
     height, width = image.shape[1:]

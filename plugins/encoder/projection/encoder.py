@@ -213,8 +213,8 @@ class Projection(Encoder):
         input_columns: names of the columns, if the data name them.
         height, width: size of the image, pixels.
         nearest, farthest: range of depths, metres. Points in [nearest, farthest) are visible, and their depth channel
-            runs from 0 to 1, so that 1 marks the background. The thesis uses depths in metres, where 1 marks the
-            background because the thesis's scanner sees 0.1 to 0.7 m (§7.3.1).
+            runs from 0 to 1, so that 1 marks the background. In the thesis the channel is in metres; 1 can mark the
+            background there too, because the scanner of the thesis sees 0.1 to 0.7 m (§7.3.1).
         levels: number of images, four channels each. Each image has half the size of the previous one and is enlarged
             again by repetition, so that a pixel between sparse points shows a point at some level.
         splat: radius, pixels, of splats that fill the surface between points; 0 for no splats. Splats add five channels

@@ -36,8 +36,9 @@ def disc(radius: int) -> np.ndarray:
 def weights(radius: int) -> np.ndarray:
     """Return a table of the weights of points in the mean that a pixel shows.
 
-    The indices of the table are the squared distance of the point from the pixel, and the squared distance of the
-    nearest point. The distances are in pixels; squared, they are 0 to radius · (radius + 1).
+    Entry (i, j) is the weight of a point at the squared distance i from the pixel, if the point whose cone is nearest
+    in this pixel (`compute_surface`) is at the squared distance j. Distances are in pixels; i and j are 0 to radius ·
+    (radius + 1).
     """
     square = np.arange(radius * (radius + 1) + 1)
     width = LEAST_WIDTH + SHARE * np.sqrt(square)

@@ -1,4 +1,4 @@
-"""Contract-test cases: rendered images of a doll, and of people with textures."""
+"""Contract-test cases: rendered images of the small body model `framework.testing.bodies.doll`, and of people."""
 
 from pathlib import Path
 

@@ -31,7 +31,7 @@ class Slim(CroppedUNet):
         widths: channels of each level. Processors compute 16 channels at once, so that 24 cost as much as 32.
         unshuffle: side of a square, pixels.
         normalisation: "batch", "renorm" or "group" (`layers.Layer`).
-        colors: number of output channels that are colours, 0 to 1.
+        colors: number of output channels that are colours, whose values are in [0, 1].
         scales: number of further output channels: logarithms of the scales of a density of the colours.
         crop: margin, pixels. Evaluation computes only the subject's bounding box and this margin around it; None: the
             whole image.

@@ -28,7 +28,7 @@ class UNet(CroppedUNet):
         levels: number of levels.
         normalisation: "batch", by the moments of the batch; "renorm", by the moments of the batch, corrected towards
             the running moments; or "group", by the moments of each image's groups of channels. See `layers.Layer`.
-        colors: number of output channels that are colours, 0 to 1.
+        colors: number of output channels that are colours, whose values are in [0, 1].
         scales: number of further output channels: logarithms of the scales of a density of the colours.
         crop: margin, pixels. Evaluation computes only the subject's bounding box and this margin around it; None: the
             whole image.

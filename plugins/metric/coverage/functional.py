@@ -30,7 +30,7 @@ SECANTS = 2
 
 
 def border(density: Distribution, value: Tensor, mass: float, samples: int) -> Region:
-    """Return the masses of highest-density regions that end at the targets, and the size of the one of mass `mass`.
+    """Return the masses of the highest-density regions that end at the targets, and the size of the region of `mass`.
 
     The region that ends at a target holds the values whose density is higher than that of the target. Its mass is `low`
     of the result; `high` is the mass of all values with at least the density of the target.

@@ -1,4 +1,4 @@
-"""Contract-test cases: targets of every kind."""
+"""Contract-test cases: classes, real numbers and angles."""
 
 from framework.target import Target
 from framework.testing.rows import MetricRow

@@ -127,7 +127,8 @@ def _intervals(density: Distribution, edges: Tensor) -> Tensor | None:
 def _arcs(density: Distribution, edges: Tensor) -> Tensor:
     """Return the probabilities of the arcs from each edge to the next, (*batch, edge).
 
-    A density that is too narrow for the grid on which probabilities are computed gets infinity, a mark for the caller.
+    If a density is too narrow for the grid on which probabilities are computed, its entries are infinite; the caller
+    then estimates them from draws.
     """
     shape = torch.Size((len(edges), *density.batch_shape))
     start, end = (

@@ -156,7 +156,12 @@ def _number_index(target: Target, number: str | None) -> int:
 
 
 def _edges(target: Target, edges: list[float] | None, edges_deg: list[float] | None) -> list[float]:
-    """Return the edges for this kind of target, in radians for an angle; an empty list for classes."""
+    """Return the edges for this kind of target, in radians for an angle; an empty list for classes.
+
+    Raises:
+        ConfigError: the edges do not suit the kind of target, are too few, not finite, not ascending, or not within one
+            turn.
+    """
     expected_setting = {"class": None, "real": "edges", "angle": "edges_deg"}[target.kind]
     for name, value in (("edges", edges), ("edges_deg", edges_deg)):
         if value is not None and name != expected_setting:
@@ -189,7 +194,7 @@ def _edges(target: Target, edges: list[float] | None, edges_deg: list[float] | N
 
 
 def _region_names(kind: str, edges: list[float] | None, edges_deg: list[float] | None) -> list[str]:
-    """Return names of the regions, formed from their ends."""
+    """Return the names of the regions between the edges, such as "below_0" for a real number or "-45_to_45_deg"."""
     if kind == "angle":
         cuts = edges_deg or []
         ends = zip(cuts, [*cuts[1:], *cuts[:1]], strict=True)
@@ -200,7 +205,16 @@ def _region_names(kind: str, edges: list[float] | None, edges_deg: list[float] |
 
 
 def _check_actions(table: list[list[float]], actions: list[str] | None, truths: list[str]) -> list[str]:
-    """Return the names of the actions, after checking that the cost table fits the actions and the truths."""
+    """Return the names of the actions, after checking that the cost table fits the actions and the classes or regions.
+
+    Args:
+        table: costs, one row for each class or region, and one column for each action.
+        actions: names of the actions; None for those of the classes or regions.
+        truths: names of the classes or regions.
+
+    Raises:
+        ConfigError: table and names do not fit together, or a cost is not allowed.
+    """
     if len(table) != len(truths) or not table[0] or len({len(row) for row in table}) > 1:
         raise ConfigError(
             f"decision_cost.costs has rows of {[len(row) for row in table]} numbers, expected {len(truths)} rows (one "

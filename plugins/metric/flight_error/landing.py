@@ -70,8 +70,8 @@ def landings(
 ) -> Float[Tensor, "4"]:
     """Return four sums over the samples whose true path lands.
 
-    The sums are: the number of these samples; the CRPS of the landing place (m); the number of true landing places
-    inside the ellipse; and the share of draws that do not land.
+    In this order: the number of these samples; the sum of the CRPS of the landing place (m); the number of true landing
+    places inside the ellipse; and the sum of the shares of draws that do not land.
 
     With the true landing place y, the CRPS of draws x_i is mean |x_i - y| - 1/2 mean |x_i - x_j| over i ≠ j, as a mean
     over x and y coordinates (Gneiting & Raftery 2007, eq. 21). The ellipse holds 90 % of a normal density with the mean

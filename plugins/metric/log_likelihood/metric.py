@@ -18,7 +18,11 @@ _log = logging.getLogger(__name__)
 
 
 class Moments(Metric):
-    """Base class of the metrics of log-likelihood, whose states are moments, and sums for the sampling error."""
+    """Base class of the metrics of log-likelihood.
+
+    The states are the moments of the log-likelihoods (`compute_moments`), and sums from which the sampling error is
+    computed (`summarize_sampling`).
+    """
 
     moments: Tensor
     sampling: Tensor

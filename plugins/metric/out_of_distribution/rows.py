@@ -1,4 +1,4 @@
-"""Contract-test cases: all scores, for classes, real numbers and angles."""
+"""Contract-test cases: entropy, confidence and mutual information, for classes, real numbers and angles."""
 
 from framework.testing.rows import ANGLE, CLASSES, REALS, MetricRow
 

@@ -1,6 +1,6 @@
-"""Contract-test cases: densities without prediction sets.
+"""Contract-test cases: none of their densities has prediction sets, so that most checks are left out.
 
-The densities of the contract tests have no prediction sets. test_prediction_set_metric.py runs the checks on sets.
+test_prediction_set_metric.py runs these checks with densities that have prediction sets.
 """
 
 from framework.target import Target

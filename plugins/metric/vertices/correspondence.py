@@ -1,4 +1,4 @@
-"""Errors of dense correspondences between scans through registered templates."""
+"""Errors of the dense correspondences between scans that follow from templates registered to the scans."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Distances between predicted and true vertices, and errors of correspondences through predicted meshes."""
+"""Distances between predicted and true vertices, and errors of the correspondences that predicted meshes give."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Literal
@@ -16,7 +16,10 @@ from framework.target import Target
 from plugins.metric.vertices.correspondence import correspondence
 
 BINS, LOWEST, HIGHEST = 2_000, 1e-4, 1e4
-"""Number of bins and limits (centimetres) of the histogram of distances; each bin is 0.9 % wide."""
+"""Number of bins and limits (centimetres) of the histogram of distances.
+
+The upper edge of each bin is 0.9 % above its lower edge.
+"""
 FAUST = "bogo2014faust"
 
 
@@ -65,10 +68,12 @@ class VertexError(Mean):
 
 
 class CorrespondenceError(Metric):
-    """Error of correspondences through predicted meshes, centimetres, over all ordered pairs of test scans (Table 6.4).
+    """Error of the correspondences between test scans that the predicted meshes give, centimetres (thesis Table 6.4).
 
-    `intra_cm` is the mean over pairs of scans of the same person, `inter_cm` over pairs of scans of two people. The
-    target is the true registration. The metric holds every predicted and true mesh until the end.
+    A point of one scan is assigned to the nearest vertex of this scan's predicted mesh; the same vertex of another
+    scan's mesh is its predicted position there (`correspondence`). `intra_cm` is the mean over ordered pairs of scans
+    of the same person, and `inter_cm` over those of two people. The target is the true registration. The metric holds
+    every predicted and true mesh until the end.
 
     Raises:
         ConfigError: the target is not made of vertices.

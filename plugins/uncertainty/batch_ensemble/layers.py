@@ -13,7 +13,7 @@ LAYERS = (nn.Linear, nn.Conv1d, nn.Conv2d, nn.Conv3d)
 
 
 class RankOne(nn.Module):
-    """Layer of the weights W ∘ (s_m r_mᵀ) for member m, computed as (W (x ∘ r_m)) ∘ s_m plus a bias of the member.
+    """Layer with the weights W ∘ (s_m r_mᵀ) for member m, computed as (W (x ∘ r_m)) ∘ s_m plus the member's bias.
 
     Factors are stored as their difference from 1, so that weight decay draws them to 1 and members to each other.
     Outside of a block `with several_members(...)`, the layer is that of the first member.
@@ -45,7 +45,7 @@ class RankOne(nn.Module):
         self.rows: int | None = None
 
     def __getattr__(self, name: str) -> Any:
-        """Return an attribute of the layer, such as its weight, whose dtype an encoder may read."""
+        """Return an attribute of the wrapped layer, such as its weight, whose dtype some encoders read."""
         try:
             return super().__getattr__(name)
         except AttributeError:
@@ -71,7 +71,10 @@ class RankOne(nn.Module):
         return torch.addcmul(parts, parts, self._of_members(factors, parts)).flatten(0, 1)
 
     def _of_members(self, numbers: Tensor, parts: Tensor) -> Tensor:
-        """Return numbers (member, channel) in a shape that broadcasts with `parts`, (sample, member, ...)."""
+        """Return the rows of `numbers` of the members in use, in a shape that broadcasts with `parts`.
+
+        `numbers` are (member, channel), and `parts` are (sample, member, ...).
+        """
         axis = parts.dim() - 1 if isinstance(self.layer, nn.Linear) else 2
         shape = [1] * (parts.dim() - 1)
         shape[0], shape[axis - 1] = self.used, numbers.shape[1]

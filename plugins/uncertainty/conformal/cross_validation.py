@@ -18,9 +18,9 @@ from framework.model import Predictor
 from framework.uncertainty import SelfTraining
 
 ENTRIES = 2**22
-"""Largest number of ends that are computed at once, for all samples of a part of a batch and all residuals."""
+"""Largest number of values μ_k(i)(x) ± R_i that are computed at once; a batch is divided accordingly."""
 SAMPLES = 1000
-"""Number of samples of a density whose median has no closed form and no search."""
+"""Number of samples from which the median of a density is estimated, if the density gives no better way."""
 
 
 def cross_validation_interval(
@@ -67,7 +67,7 @@ def centres_of_parts(model: Predictor, wrapper: SelfTraining, inputs: Tensor) ->
 
 @contextmanager
 def leaving_out(wrapper: SelfTraining, part: int) -> Iterator[None]:
-    """Let all samples be predicted, inside the block, by the models that left out this part."""
+    """Inside the block, let `wrapper` predict all samples by the models that left out this part in training."""
     wrapper.left_out = part
     try:
         yield
@@ -111,12 +111,12 @@ class IntervalSet(Unchanged, ValueSet):
         return self.low > self.high
 
     def intervals(self) -> list[list[tuple[float, float]]]:
-        """Return the interval (low, high) of every item of the flattened batch."""
+        """Return for every item of the flattened batch the list of its intervals (low, high): one, or none if empty."""
         pairs = zip(self.low.flatten().tolist(), self.high.flatten().tolist(), strict=True)
         return [[pair] if pair[0] <= pair[1] else [] for pair in pairs]
 
     def parts(self) -> list[list[tuple[float, float]]]:
-        """Return the intervals."""
+        """Return the intervals of every item, as `intervals` does."""
         return self.intervals()
 
 

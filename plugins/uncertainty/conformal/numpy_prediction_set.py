@@ -1,4 +1,4 @@
-"""Prediction sets of an exported model, computed with NumPy alone."""
+"""Prediction sets, for exported models, computed with NumPy alone."""
 
 import math
 from typing import Any

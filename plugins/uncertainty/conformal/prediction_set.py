@@ -40,10 +40,10 @@ class PredictionSet(Unchanged, ValueSet):
     - "density": -log p(y), nats. The set holds the values with a density above one level, the same for every item (for
       classes Sadinle, Lei & Wasserman 2019).
     - "mass": -log of the probability of all values with a smaller density than y, nats. The set is the smallest region
-      of one probability, the same for every item (for classes Romano, Sesia & Candès 2020, for numbers a
-      highest-density region). For classes, a share u(x) in (0, 1) of p(y) itself is added to this probability; u(x)
-      looks random, but is a function of the density. Without u(x), the least likely class would always have an infinite
-      score, whatever its probability.
+      of a given probability, which is the same for every item (for classes Romano, Sesia & Candès 2020, for numbers a
+      highest-density region). For classes, (1 - u(x)) p(y) is added to this probability; u(x) in (0, 1) looks random,
+      but is a function of the density. Without this term, the least likely class would always have an infinite score,
+      whatever its probability.
     - "quantiles": max(a - y, y - b) for the ends a and b of the central interval of the stated probability, for one
       real number in its unit. The set is the interval from a - threshold to b + threshold (conformalised quantile
       regression; Romano, Patterson & Candès 2019, eq. 6 and 8).
@@ -333,7 +333,7 @@ class PredictionSet(Unchanged, ValueSet):
 def _label_scores(log_prob: Tensor, every: Float[Tensor, "label *batch"]) -> Tensor:
     """Return the mass score of labels y, nats: -log(Σ_j p_j + (1 - u) p(y)), with the sum over all j with p_j < p(y).
 
-    u is the share u(x) of `PredictionSet`. Romano, Sesia & Candès 2020 (eq. 5) sum over the more probable labels
+    u is the u(x) of `PredictionSet`. Romano, Sesia & Candès 2020 (eq. 5) sum over the more probable labels
     instead. Their sum is 1 minus this one, and rounds to 1 where small differences matter.
 
     Args:
@@ -391,9 +391,9 @@ def _(density: PredictionSet) -> Float[Tensor, "*batch"] | None:
 
 @marginal.register
 def _(density: PredictionSet, index: int) -> Distribution:
-    """Return the marginal density of one number, without a prediction set.
+    """Return the marginal density of one number, without a prediction set if there are several numbers.
 
-    The coverage of the set holds for all numbers together, and says nothing about a single number.
+    The coverage of the set holds for all numbers together, and says nothing about a single one of several numbers.
     """
     return density if tuple(density.event_shape) == (1,) and index == 0 else marginal(density.density, index)
 

@@ -199,7 +199,7 @@ class Conformal(Uncertainty):
 
 
 def parted_wrapper(model: Predictor) -> SelfTraining:
-    """Return the wrapper inside a predictor that trains models on all but a part of the samples.
+    """Return the wrapper, somewhere inside a predictor, that trains several models, each without a part of the samples.
 
     Raises:
         ConfigError: there is no such wrapper.

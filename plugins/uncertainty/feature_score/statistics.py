@@ -75,10 +75,10 @@ def fit_clusters(parts: Parts, classes: int, shrinkage: float | None) -> Cluster
 def merge_clusters(clusters: Clusters) -> Clusters:
     """Return the mean and the covariance of all classes together, as one class, by the law of total covariance.
 
-    With the means μ_c, their mean μ over all samples, and n_c of N samples, the covariance is Σ + Σ_c n_c/N (μ_c - μ)
-    (μ_c - μ)ᵀ. Without shrinkage it is the empirical covariance of all samples, as in Ren et al. 2021. A shrinkage of
-    its own would be another one than that of Σ. In directions in which the training samples hardly vary, one of the
-    two distances would then be many times the other, whatever the classes are.
+    With the mean μ_c of the n_c samples of each class, and the mean μ of all N samples, the covariance is Σ + Σ_c n_c/N
+    (μ_c - μ)(μ_c - μ)ᵀ. If Σ has no shrinkage, this is the empirical covariance of all samples, as in Ren et al. 2021.
+    Otherwise it contains the shrinkage of Σ, and none is added. A second, different shrinkage would make one of the two
+    distances many times the other in directions in which the training samples hardly vary, whatever the classes are.
     """
     shares = clusters.counts.to(clusters.means) / clusters.counts.sum()
     mean = shares @ clusters.means

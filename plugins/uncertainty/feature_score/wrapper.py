@@ -54,8 +54,8 @@ class FeatureScore(Uncertainty, ReadsTraining):
 
     - "mahalanobis": squared Mahalanobis distance from the nearest class, with one covariance for all classes (Lee et
       al. 2018). A target that is no class counts as a single class.
-    - "relative_mahalanobis": this distance minus the distance in the normal density of all classes together (Ren et al.
-      2021), whose covariance has the shrinkage of the first one.
+    - "relative_mahalanobis": this distance minus the squared Mahalanobis distance from the mean of all training samples
+      (Ren et al. 2021). The covariance of the second distance is the first one plus that of the class means.
     - "knn": distance from the k-th nearest of the stored training samples (Sun et al. 2022).
     - "energy": -log Σ exp of the logits (Liu et al. 2020), which needs no statistics of training samples.
 
@@ -193,7 +193,7 @@ class FeatureScore(Uncertainty, ReadsTraining):
         return mahalanobis(features, means.double(), counts, whitening.double())
 
     def _prepare(self, features: Float[Tensor, "batch feature"]) -> Float[Tensor, "batch feature"]:
-        """Return the features as the statistics read them, float64."""
+        """Return the features in float64, scaled to Euclidean length 1 if `normalise` is set."""
         features = features.double()
         return to_unit_length(features) if self.normalise else features
 

@@ -26,8 +26,8 @@ class Chain(nn.Module):
     trains every member as it would train alone.
 
     Args:
-        networks: networks that `layers_of` accepts, one group after another; their weights are copied. All groups have
-            the same number of networks.
+        networks: networks that `layers_of` accepts; their weights are copied. They form groups of equal size, one group
+            after another; the networks of a group have the same dropout.
         dropout: for each group, the probability of all dropout layers; None keeps the probabilities of the networks.
     """
 
@@ -72,7 +72,10 @@ class Chain(nn.Module):
         return numbers
 
     def _drop(self, numbers: Tensor, default: float) -> Tensor:
-        """Return the numbers after dropout with the probability of each group."""
+        """Return the numbers after dropout, for which each group has its own probability.
+
+        `default` is the probability for groups whose `dropout` is None.
+        """
         probabilities = [default if chosen is None else chosen for chosen in self.dropout]
         if not any(probabilities):
             return numbers

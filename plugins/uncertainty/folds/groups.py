@@ -25,7 +25,7 @@ class Together(nn.Module):
     Args:
         chain: networks of all models, from inputs to raw parameters.
         head: density head without trained parameters, which is copied for each group.
-        groups: G, the number of groups.
+        groups: G, the number of groups; model k of group g has the number g K + k in the chain.
     """
 
     def __init__(self, chain: Chain, head: DensityHead, groups: int) -> None:
@@ -83,7 +83,8 @@ class Together(nn.Module):
 
         Args:
             batches: samples.
-            fold: number of the model in its group that has not seen each sample; None: no model has seen any.
+            fold: for each batch, the fold of each of its samples; model k of each group has not seen the samples of
+                fold k. None if no model has seen any of the samples.
         """
         raws: list[list[Tensor]] = [[] for _ in self.heads]
         targets = []
@@ -116,7 +117,7 @@ class Apart(nn.Module):
     """Models that are computed one after the other.
 
     Args:
-        models: the models of all groups.
+        models: the models of all groups, one group after another; all groups have the same number of models.
         dropout: probability of all dropout layers, for each group; None leaves them as they are.
     """
 
@@ -177,7 +178,8 @@ class Apart(nn.Module):
 
         Args:
             batches: samples.
-            fold: number of the model in its group that has not seen each sample; None: no model has seen any.
+            fold: for each batch, the fold of each of its samples; model k of each group has not seen the samples of
+                fold k. None if no model has seen any of the samples.
         """
         for number, model in enumerate(self._all()):
             own = batches

@@ -26,7 +26,7 @@ from plugins.uncertainty.folds.training import MOST_STEPS, Schedule, Training, a
 Probability = Annotated[float, Field(ge=0, lt=1)]
 Decay = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 PSEUDO = 2.0
-"""Number of samples that are added to the share of each group when the weights of the groups are fitted."""
+"""Pseudo-count: number of samples that are added for each group when the weights of the groups are fitted."""
 EM_STEPS = 200
 """Number of steps of expectation maximisation that fit the weights of the groups; the last steps change little."""
 UNLIKELY = 20.0
@@ -134,7 +134,7 @@ class Folds(Uncertainty, SelfTraining):
         return None if self.rows is None else self.part_of(self.rows)
 
     def part_of(self, rows: Int[Tensor, "sample"]) -> Int[Tensor, "sample"]:
-        """Return the fold of each of these samples that trained the models."""
+        """Return the fold of each sample; `rows` are row numbers in the data that `train_models` read."""
         assert self._fold is not None
         return self._fold[rows.cpu()]
 
@@ -194,9 +194,9 @@ class Folds(Uncertainty, SelfTraining):
 
     @torch.no_grad()
     def _calibrate_held_out(self, inputs: Tensor, target: Tensor) -> float:
-        """Calibrate heads and weights on the samples that trained, each predicted by models that did not see it.
+        """Calibrate the heads and the weights of the groups, and return the mean loss of all samples, nats.
 
-        Return their mean loss, nats.
+        `inputs` and `target` are the samples of the training; models that did not see a sample predict it.
         """
         assert self._fold is not None
         rows = torch.arange(len(inputs)).split(BLOCK)

@@ -120,7 +120,15 @@ def log_probs_and_scores(
 def _constant_hessian(
     density: Distribution, leaf: Float[Tensor, "batch raw"], targets: list[Tensor]
 ) -> Float[Tensor, "batch raw raw"] | None:
-    """Return the Hessian of -log p in the raw parameters if two targets have the same one; None otherwise."""
+    """Return the Hessian of -log p with respect to the raw parameters if two targets have the same one; None otherwise.
+
+    The result is also None if the Hessian is not positive semi-definite or cannot be computed.
+
+    Args:
+        density: density whose raw parameters are `leaf`.
+        leaf: raw parameters, with gradient.
+        targets: targets, of which the first two are compared.
+    """
     hessians = []
     try:
         for target in targets[:2]:
@@ -177,11 +185,12 @@ def collect(
 
 
 def most_likely_precision(eigenvalues: Float[Tensor, "weight"], square: float) -> float:
-    """Return the precision λ of the prior of highest marginal likelihood.
+    """Return the precision λ of the prior for which the marginal likelihood of the training data is highest.
 
-    The terms of its Laplace approximation that depend on λ are, for P weights, P/2 log λ - λ/2 |W*|² - 1/2 log det(H +
-    λ I). Their derivative in log λ is (γ - λ |W*|²) / 2, with the number γ = Σ h/(h + λ) of determined weights (MacKay
-    1992). The derivative decreases in λ, so its only zero is found by bisection. λ is bounded by e^±LARGEST_EXPONENT.
+    The marginal likelihood is computed by the Laplace approximation. Its terms that depend on λ are, for P weights, P/2
+    log λ - λ/2 |W*|² - 1/2 log det(H + λ I). Their derivative with respect to log λ is (γ - λ |W*|²) / 2, with the
+    number γ = Σ h/(h + λ) of determined weights (MacKay 1992). The derivative decreases in λ, so its only zero is found
+    by bisection. λ is bounded by e^±LARGEST_EXPONENT.
 
     Args:
         eigenvalues: eigenvalues h of H.

@@ -168,7 +168,10 @@ class Laplace(Uncertainty, ReadsTraining):
 
     @torch.no_grad()
     def _choose_precision(self, batches: list[Batch]) -> None:
-        """Set λ to the value of highest likelihood of the validation split among factors on the present value."""
+        """Set λ to the candidate for which the likelihood of the validation split is highest.
+
+        The candidates are infinity, and the present λ times 10 to the powers DECADES.
+        """
         passes = [(batch, *self._features_and_raw(batch["input"])) for batch in batches]
         start = self.precision.clone()
         best, best_value = start.new_tensor(math.inf), -math.inf
