@@ -277,7 +277,8 @@ class BodyModel(nn.Module):
     ) -> Float[Tensor, "batch vertex 3 3"]:
         """Return Σ_j w_j R_j of each vertex, the linear part of its skinning transform (W of thesis eq. 7.1).
 
-        w_j is the vertex's skinning weight of joint j, and R_j the rotation of joint j relative to the world.
+        w_j is the vertex's skinning weight of joint j, and R_j the rotation of joint j relative to the world. `shape`
+        and `pose` are arguments of `forward`.
         """
         self._check(shape, pose, None)
         blended = self._blended(shape, rotation_minus_identity(pose.double()))[:, :9]
@@ -290,7 +291,7 @@ class BodyModel(nn.Module):
     def posed_joints(
         self, shape: Float[Tensor, "batch shape"], pose: Float[Tensor, "batch joint 3"]
     ) -> Float[Tensor, "batch joint 3"]:
-        """Return the positions of the joints in a pose, metres."""
+        """Return the positions of the joints in a pose, metres; `shape` and `pose` are arguments of `forward`."""
         self._check(shape, pose, None)
         joints = self.rest_joints(shape).double()
         transforms = self._transforms(shape, rotation_minus_identity(pose.double()))

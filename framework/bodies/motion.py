@@ -31,8 +31,8 @@ BONES = {
 }
 """Names that BVH files use for the joint of each role of framework.bodies.poses.Skeleton.
 
-The names are in lower case, and without a prefix that ends with a colon. `{side}` stands for the side of the body. If a
-file has joints with several names of one role, the first of these names in the tuple is used.
+The names are in lower case, without underscores and without a prefix that ends with a colon. `{side}` stands for the
+side of the body. If a file has joints with several names of one role, the first of these names in the tuple is used.
 """
 ENDS = {"arm": "elbow", "elbow": "wrist", "hip": "knee", "knee": "ankle"}
 """Bones whose directions are taken from the file, as joint at the beginning → joint at the end of the bone.

@@ -269,7 +269,7 @@ def _in_mean_pose(body: Body, traits: Traits | None, where: poses.Skeleton) -> t
 def _free_movements(
     body: Body, place: dict[str, int]
 ) -> tuple[list[tuple[int, np.ndarray, str]], dict[str, poses.Range]]:
-    """Return joint, axis and name of every free movement, and the limits of all movements.
+    """Return joint, axis and name of every free movement, and the `Range` of all movements by name.
 
     `place` maps a role, such as "left arm", to the number of a joint.
     """

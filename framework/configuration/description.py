@@ -40,7 +40,8 @@ class Description:
         path: Path of the checkpoint from which the description was read.
         dropped: Paths in the stored config that the user has not repeated, by dotted keys; in `config` these keys have
             their defaults.
-        remarks: Sentences for the user that the uncertainty wrappers return after calibration (`Uncertainty.remark`).
+        remarks: Sentences for the user: the remarks of wrappers and heads (`Uncertainty.remark`, `Fitted.remark`) and,
+            after a search for a budget, the chosen setting of the knobs.
     """
 
     config: Resolved

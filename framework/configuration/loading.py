@@ -261,10 +261,10 @@ def rebuild(description: Description, state: Mapping[str, torch.Tensor]) -> Pred
 
 
 def bound_first_prediction(predictor: Predictor, path: str) -> None:
-    """Limit the memory of the first prediction of a stored model (`budget.predicting`).
+    """Limit the memory of predictions of a stored model (`budget.predicting`).
 
     A prediction that would take far more memory than the sizes of the model's weights and of the inputs justify raises
-    an error before the memory is allocated.
+    an error before the memory is allocated. The limit holds for every batch with more samples than all earlier ones.
     """
     # a frozen model calls the fixed encoders and the predictor behind them separately
     split = isinstance(predictor, FrozenFrontEnd)

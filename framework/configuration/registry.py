@@ -98,7 +98,8 @@ def load(group: str, name: str) -> type[Any]:
     """Import and return the class called `name`; plugins are imported here and nowhere else.
 
     Raises:
-        ConfigError: There is no such name, the import fails, or the class does not implement all of the group's base.
+        ConfigError: There is no such name, the import fails, or the class is no complete implementation of the group's
+            base class.
     """
     entry = find(group, name)
     # the contract is imported before its plugin, because framework.metric imports torchmetrics in its own way

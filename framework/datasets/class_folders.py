@@ -113,6 +113,9 @@ def collect(
         suffixes: Suffixes of the files to return, in small letters.
         kind: Name of a file with one of these suffixes, for messages.
         remedy: Advice in messages.
+
+    Raises:
+        DataError: A folder has no file with one of the suffixes.
     """
     files, labels, splits, ignored = [], [], [], 0
     for name, split, folder in folders_of_class:

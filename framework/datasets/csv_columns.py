@@ -423,8 +423,8 @@ def numeric_columns(columns: Columns, but: Collection[str], setting: str) -> Col
         setting: the setting that names columns, for example "data.columns".
 
     Raises:
-        DataError: most cells of a column are numbers in another notation; the message names the setting that reads
-            them.
+        DataError: most cells of a column are numbers, but some of them in another notation; the message names the
+            setting that reads these.
     """
     names: list[str] = []
     left_out, odd = dict(columns.left_out), {}

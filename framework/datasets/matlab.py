@@ -160,7 +160,10 @@ class _Reader:
         return np.frombuffer(content[start:end], self.order + NUMBERS[kind]), _align(end)
 
     def array(self, content: bytes, start: int, end: int, depth: int) -> Any:
-        """Return the array between the bytes `start` and `end`, including all arrays inside it."""
+        """Return the array between the bytes `start` and `end`, including all arrays inside it.
+
+        `depth` is the number of arrays around this array.
+        """
         if start == end:
             return np.empty(0)
         head = self.head(content, start, end)

@@ -72,13 +72,14 @@ def choose_splits(
     test: float,
     random: np.random.Generator,
 ) -> NDArray:
-    """Return the split of every sample; samples that have no split yet get one at random.
+    """Return the split of every sample, chosen at random where none is given.
 
     Args:
         splits: Split of each sample; "" if the sample has none yet.
         labels: Class of each sample.
-        validation: Share of the samples for validation. It is not used if `splits` contains "validation".
-        test: Share of the samples for the test. It is used only if some samples have no split yet.
+        validation: Share for validation: of the samples without a split or, if all samples have one, of the training
+            samples. It is not used if `splits` contains "validation".
+        test: Share for the test, of the samples without a split.
         random: Generator of the choice.
     """
     chosen = np.where(splits == "", "train", splits)

@@ -46,7 +46,7 @@ FORMAT = 1
 PARITY = 1e-5
 """Largest accepted difference between the exported and the original model's parameters of the density.
 
-It is a share of the largest parameter.
+It is a share of the largest parameter of an input, or of 1 if this parameter is smaller.
 """
 ROUNDING = 4.0
 """Factor on the rounding error of the original model, up to which a difference is accepted for extreme inputs.
@@ -458,7 +458,8 @@ def _compare(
 ) -> dict[str, dict[str, float]]:
     """Return the largest differences between the exported and the original model.
 
-    Log-densities of a family that replaces an estimate (`Exported.remark`) are not compared.
+    The keys are the kind of inputs (`EXTREMES`), and then "parameters" or "log_density". Log-densities of a family that
+    replaces an estimate (`Exported.remark`) are not compared.
 
     Raises:
         ConfigError: a difference is above its limit.
@@ -507,7 +508,16 @@ def _compare(
 def _rounding(
     model: Exporting, arrays: Tensor, numbers: Sequence[Tensor], own: Mapping[str, np.ndarray]
 ) -> float:
-    """Return the largest difference between the original model and itself in float64; 0 if it has no float64 form."""
+    """Return the largest difference between the parameters of the original model and of the same model in float64.
+
+    The result is 0 if the model cannot compute in float64.
+
+    Args:
+        model: the original model.
+        arrays: the user's arrays, (batch, *input_shape).
+        numbers: the random numbers that the model uses.
+        own: parameters of the density from the original model, by name.
+    """
     double = replace(model, predictor=copy.deepcopy(model.predictor).double())
     try:
         with given_draws([number.double() for number in numbers]):
@@ -530,7 +540,7 @@ def feed(arrays: Tensor, noises: Sequence[ModelNoise], numbers: Sequence[Tensor]
 
 
 def _difference(computed: np.ndarray, expected: np.ndarray) -> float:
-    """Return the largest difference of two arrays, relative to the largest number in its row.
+    """Return the largest difference of two arrays, as a share of max(1, largest |number| of `expected` in the row).
 
     The result is infinite if the shapes differ, or if only one of the arrays has NaN at some position.
     """

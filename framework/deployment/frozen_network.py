@@ -89,7 +89,7 @@ class Network:
         result: number of the register with the raw parameters.
         dtype: data type of all numbers.
         classes: True if the register `result` has class logits instead of raw parameters.
-        session: ONNX Runtime's session for two or more samples; None if torch computes them.
+        session: ONNX Runtime's session for two or more samples; None if torch computes them, and before the first call.
         cast_to_type: True after `cast` has converted weights and biases to `dtype`.
     """
 

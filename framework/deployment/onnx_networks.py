@@ -127,7 +127,10 @@ def _probe(count: int, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
 
 @torch.no_grad()
 def _trains(predictor: Predictor, probe: Tensor) -> bool:
-    """Return whether a layer is in training mode while the predictor evaluates, as dropout layers may be."""
+    """Return whether a layer is in training mode while the predictor evaluates, as dropout layers may be.
+
+    The result is also true if the predictor cannot read `probe`.
+    """
     trains: list[bool] = []
     hooks = [
         module.register_forward_pre_hook(lambda module, _: trains.append(module.training))

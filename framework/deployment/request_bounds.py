@@ -47,7 +47,7 @@ class Ticket:
         seconds: time limit of the request.
         deadline: end of the time limit, as a value of `time.monotonic`.
         sentence: message that says why the model refused the request; "" if it did not.
-        remarks: remarks of the uncertainty wrappers, which are sent to the client with the table of predictions.
+        remarks: remarks in the model's description, which are sent to the client with the table of predictions.
     """
 
     seconds: float
@@ -67,7 +67,7 @@ class Ticket:
 
 
 REMARK = b"x-model-remark"
-"""Name of the response header for a remark that an uncertainty wrapper of the model made when it was calibrated."""
+"""Name of the response header for a remark in the model's description (`Description.remarks`)."""
 
 
 @dataclass
@@ -79,7 +79,7 @@ class ReceivedBody:
 
 
 TICKET: ContextVar[Ticket | None] = ContextVar("ticket", default=None)
-"""Data of the request that is being answered (`Ticket`); None in a process that is not a server."""
+"""Data of the request that is being answered (`Ticket`); None if there is none, as outside of a server."""
 
 
 def too_long_message(seconds: float) -> str:

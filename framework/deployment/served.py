@@ -86,8 +86,8 @@ class ServedModel:
     def predict_table(self, inputs: Any) -> pd.DataFrame:
         """Return a table with one row per sample, including the columns of prediction sets (`set_columns`).
 
-        A predicted image is a PNG file in base64. The entry "remarks" of the table's `attrs` has the remarks that
-        `mode=predict` prints about the prediction sets.
+        A predicted image is a PNG file in base64. The entry "remarks" of the table's `attrs` has the remarks in the
+        model's description (`Description.remarks`).
 
         Args:
             inputs: inputs that the model of `framework.load` accepts, but files only as `pathlib.Path`; or the contents

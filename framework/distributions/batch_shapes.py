@@ -140,7 +140,10 @@ class Reshaped(DerivedDensity):
 
 
 def _register_density(function: Any) -> None:
-    """Register a function (density, argument) → density for `Stacked` and `Reshaped`: apply it to inner densities."""
+    """Register methods of a function (density, argument) → density for `Stacked` and `Reshaped`.
+
+    They apply the function to the wrapped densities, and stack or reshape the results.
+    """
 
     @function.register
     def _(density: Stacked, argument: Any) -> Distribution:
@@ -179,9 +182,10 @@ def _(density: Reshaped, value: Tensor) -> protocol.Estimate:
 
 
 def _register_number(function: Any) -> None:
-    """Register methods that apply a function of density and value to the densities in `Stacked` and `Reshaped`.
+    """Register methods of a function (density, value) → tensor for `Stacked` and `Reshaped`.
 
-    The function returns a tensor (*sample, *batch) or None.
+    They apply the function to the wrapped densities, and stack or reshape the results. The function returns a tensor
+    (*sample, *batch) or None.
     """
 
     @function.register

@@ -424,10 +424,10 @@ def _(density: Mixture) -> Tensor:
 
 @protocol.images.register
 def _(density: Mixture, channels: Collection[str]) -> dict[str, Tensor]:
-    """Return the images of a single component; for several components over images, the weighted mean of their images.
+    """Return the images of a single component; for several components over images, the weighted mean of their "color".
 
-    Several components over other targets have no image: the image of each component shows its own point prediction,
-    which is not the point prediction of the mixture.
+    Several components over images have no other channel. Several components over other targets have no image: the image
+    of each component shows its own point prediction, which is not the point prediction of the mixture.
     """
     if density.log_weights.shape[-1] == 1:
         axis = len(density.batch_shape)

@@ -75,9 +75,17 @@ def _heights(
     width: Tensor,
     circle: bool,
 ) -> Tensor | None:
-    """Return the interpolated density of the mixture at each mode, up to a common factor.
+    """Return the interpolated density of a mixture at each mode, for one item of the batch, up to a common factor.
 
-    `index` is the item of the batch. The result is None if the density cannot be interpolated.
+    The result is None if the density cannot be interpolated.
+
+    Args:
+        components: the components, with batch_shape (*batch, K).
+        index: index of the item, one tensor for each batch dimension before K.
+        log_weights: logarithms of the weights, (K,), nats.
+        place: mode of each component, (K,).
+        width: peak width of each component, (K,).
+        circle: true if the number is an angle.
     """
     if not bool((width.isfinite() & (width > 0) & place.isfinite()).all()):
         return None

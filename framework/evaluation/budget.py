@@ -1,8 +1,8 @@
 """Cheapest setting of a model's knobs that meets a limit of run time or error, measured on this machine.
 
-The run times come from `run_times`, and the errors from `evaluate`, as in mode=work_precision. Every measurement that
-decides is repeated with the chosen setting, with other random numbers, before the setting is accepted. So no setting is
-chosen only because chance made its first measurement good.
+The run times come from `run_times`, and the errors from `evaluate`, as in mode=work_precision. Before a setting is
+accepted, the limited quantity is measured once more with this setting: the run time, or the error with other random
+numbers. So no setting meets the limit only because chance made its first measurement good.
 """
 
 import math
@@ -352,7 +352,10 @@ class Bench:
 
 
 def _within_time(bench: Bench, limit: float) -> tuple[Setting, str]:
-    """Return the cheapest of the settings within a run time that are as good as the best of them, and the reason."""
+    """Return the fastest of the settings with equally low errors within `limit` ms per sample, and the reason.
+
+    Errors that exceed the lowest one by at most one standard error count as equally low (`Bench.equals`).
+    """
     fastest = bench.by_time()[0]
     fitting = [setting for setting in bench.by_time() if bench.milliseconds[setting] <= limit] or [fastest]
     for setting in track_progress(fitting, "measuring errors", len(fitting), "settings"):
@@ -378,7 +381,7 @@ def _within_time(bench: Bench, limit: float) -> tuple[Setting, str]:
 
 
 def _within_error(bench: Bench, limit: float) -> tuple[Setting, str]:
-    """Return the cheapest setting within an error, and the reason."""
+    """Return the fastest setting whose error is within `limit`, also with other random numbers, and the reason."""
     order, key = bench.by_time(), bench.measure.key
     sign, side = bench.measure.sign, "at most" if bench.measure.sign > 0 else "at least"
     for setting in track_progress(order, "measuring errors", len(order), "settings"):

@@ -85,9 +85,9 @@ def errors(log_probs: LogProbs, value: int, seeds: Sequence[int], reference: Ref
     "error_nats" is the root mean square, over the seeds, of the mean log-likelihood minus the reference. "bias_nats" is
     the absolute value of the mean of these differences over the seeds. "sample_error_nats" is the root mean square,
     over seeds and samples, of one sample's log-likelihood minus its reference, which is the typical error for a single
-    sample. "log_likelihood_nats" is averaged over samples and seeds. The standard errors "<key>_sem" are over the
-    seeds, NaN for a single seed. The standard error of a root mean square sqrt(m) is that of m divided by 2 sqrt(m)
-    (delta method).
+    sample. "log_likelihood_nats" is averaged over samples and seeds. The standard errors "error_nats_sem" and
+    "log_likelihood_nats_sem" are over the seeds, NaN for a single seed. The standard error of a root mean square
+    sqrt(m) is that of m divided by 2 sqrt(m) (delta method).
 
     Args:
         log_probs: function of a value of the knob and a seed that returns the log-likelihood of each sample.

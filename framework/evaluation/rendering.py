@@ -30,7 +30,7 @@ class Frame:
 
     Attributes:
         name: name of the frame.
-        scene: colours with four channels, the last of which is 1 everywhere (`framework.renderer.HasScenes`).
+        scene: the scene, whose colours have a fourth channel that is 1 everywhere (`framework.renderer.HasScenes`).
         truth: fields of a batch of one: "index", "group" and the true images that are known.
     """
 

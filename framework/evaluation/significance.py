@@ -41,14 +41,12 @@ class Mean:
 def mean(numbers: Mapping[str, object], key: str, runs: object) -> Mean:
     """Return the mean `key` of a result with its standard error.
 
-    The standard error is "<key>_sem", over the test samples of one run. If `numbers` lacks it, it is computed from
-    "<key>_std", the standard deviation over `runs` runs. A whole number (such as a count of parameters) with neither
-    of these keys is exact.
+    The standard error is "<key>_sem". If `numbers` lacks it, it is computed from "<key>_std", the standard deviation
+    over `runs` runs. A whole number (such as a count of parameters) with neither of these keys is exact.
 
     Args:
-        numbers: numbers of a result by key, as in results.json. "repeats", if given, is the number of repeats over
-            which a "<key>_sem" was computed; otherwise "test_samples" is the number of test samples over which it was
-            computed.
+        numbers: numbers of a result by key, as in results.json. If "repeats" is among them, "<key>_sem" was computed
+            over this number of runs, otherwise over the test samples of one run, whose number is "test_samples".
         key: key of the mean.
         runs: number of runs over which the mean was computed; anything but a whole number means that it is not known.
     """

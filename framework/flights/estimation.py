@@ -99,7 +99,7 @@ def estimate_states(
     prior: Prior = Prior(),  # noqa: B008 - never changed
     most: int = 40,
 ) -> Estimate:
-    """Return the most likely state of each flight.
+    """Return the most probable state of each flight at the first frame, with its covariance.
 
     The state is found by least squares with Cauchy's loss, and with the prior as further residuals. Cauchy's loss c²/2
     log(1 + (r/c)²) of a residual r is half the square of c √log(1 + (r/c)²) (Holland & Welsch 1977).

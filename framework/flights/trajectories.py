@@ -55,7 +55,7 @@ def step(
 ) -> Float[Tensor, "flight 9"]:
     """Return the state after `time` seconds, with at most one bounce during that time.
 
-    If the ball would fall onto the table a second time within `time`, it is put onto the table without vertical
+    If the ball would fall onto the table a second time within `time`, it is put onto the table without downward
     velocity, so that the number of bounces stays finite.
     """
     after = free_flight(state, time, constants)

@@ -36,9 +36,10 @@ class Parsed(NamedTuple):
 
     Attributes:
         vertices: coordinates.
-        faces: triangles, as rows of `vertices`.
+        faces: triangles, as indices of vertices.
         columns: names of the vertices' attributes.
-        attributes: one column for each name in `columns`, with values as in the file; None if there are no attributes.
+        attributes: one column for each name in `columns`, with values as in the file, except that unsigned integer
+            colours are scaled to 0…1; None if there are no attributes.
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
@@ -493,8 +494,8 @@ def npy(content: bytes) -> Parsed:
 def npz(content: bytes) -> Parsed:
     """Parse a NumPy archive with points, and perhaps attributes and faces.
 
-    The points are the array `points`, or the only array. `normals`, `colors` and every other array with a row for each
-    point are attributes. `faces` are triangles.
+    The points are the array `points`, or the only array. `normals`, `colors` and every other array with one number for
+    each point are attributes. `faces` are triangles.
     """
     stored_arrays = arrays.read_npz(content)
     require_numbers(sum(array.size for array in stored_arrays.values()), MOST_NUMBERS, len(content))

@@ -37,7 +37,7 @@ class Mesh:
         vertices: coordinates in the file's unit, finite.
         faces: indices of the three vertices of each triangle, counter-clockwise seen from outside.
         columns: names of the attributes: "red", "green", "blue" (0…1), "normal_x" and so on, or the file's own names.
-        attributes: a number for each vertex and column, as in the file; it may be NaN.
+        attributes: a number for each vertex and column, as in `Parsed`; it may be NaN.
         dropped: number of vertices that were left out because a coordinate was not finite (only with `drop_non_finite`
             of `read`).
     """

@@ -111,7 +111,14 @@ def _wrap(angle: Tensor) -> Tensor:
 
 
 def _direction(pixel: Tensor, x: Tensor, y: Tensor, side: int) -> tuple[Tensor, Tensor]:
-    """Return sin e and the tilt, radians, at the place (x, y), from 0 to 1, in each pixel."""
+    """Return sin e and the tilt, radians, of a point in each HEALPix pixel.
+
+    Args:
+        pixel: number of the pixel.
+        x: position of the point along the first side of the pixel, from 0 to 1.
+        y: position of the point along the second side of the pixel, from 0 to 1.
+        side: number of pixels along a side of each of the 12 faces of the sphere.
+    """
     face, inside = pixel // side**2, pixel % side**2
     column, row = inside // side + x, inside % side + y
     band, quarter = face // 4, face % 4
@@ -127,7 +134,13 @@ def _direction(pixel: Tensor, x: Tensor, y: Tensor, side: int) -> tuple[Tensor, 
 
 
 def _pixel(height: Tensor, tilt: Tensor, side: int) -> Tensor:
-    """Return the number of the pixel of each direction, given by sin e and the tilt, radians."""
+    """Return the number of the HEALPix pixel that contains each direction.
+
+    Args:
+        height: sin e of the direction.
+        tilt: tilt of the direction, radians.
+        side: number of pixels along a side of each of the 12 faces of the sphere.
+    """
     quarter = torch.remainder(tilt, 2 * math.pi) / (math.pi / 2)
     quarter = torch.where(quarter >= 4, 0.0, quarter)
     # between the polar caps, two families of lines divide the faces
