@@ -121,7 +121,10 @@ def pose_without_offsets(person: Subject, pose: np.ndarray, change: Tensor | flo
 
 @torch.no_grad()
 def measure(truth: Truth, name: Name) -> dict[str, Tensor]:
-    """Return each quantity of the table for a topology, as a mean over people, poses and shapes."""
+    """Return each quantity of the table for a topology, over people, poses and shapes.
+
+    "back" and "folded" are the largest of all; the others are means.
+    """
     values: dict[str, list[Tensor]] = {}
 
     def note(quantity: str, *numbers: Tensor | float) -> None:

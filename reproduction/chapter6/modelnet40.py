@@ -248,7 +248,7 @@ def seed_variance(values: Float[np.ndarray, "seeds clouds"]) -> float:
 
 
 def pooled_seed_variance(methods: Mapping[str, Method], score: str) -> float:
-    """Return the mean of `seed_variance` over all methods with several seeds, or NaN if there is none.
+    """Return the mean of `seed_variance` over methods with several seeds: 0 if negative, NaN if there are none.
 
     Args:
         methods: Scores of each method.
