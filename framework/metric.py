@@ -90,7 +90,7 @@ class Mean(Metric):
     def mean_and_error(self) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
         """Return the mean over samples and its standard error.
 
-        Both are NaN if there are no samples, and the standard error is also NaN if there is only one.
+        Without samples both are NaN. With one sample only the standard error is NaN.
         """
         mean = self.total / self.count
         spread = (self.squares / self.count - mean.square()).clamp(min=0)  # (n - 1)/n of the sample variance

@@ -192,7 +192,7 @@ def table_columns(target: Target, prediction: Prediction) -> dict[str, Tensor]:
 def named_columns(target: Target, values: Tensor, of: str = "") -> dict[str, Tensor]:
     """Return angles (in degrees) or reals, (batch, number), as columns by name.
 
-    `of` is a suffix of the names that says what the values are, if they are not the predictions.
+    `of` is appended to each name, to say what the values are; "" for the predictions themselves.
     """
     if target.kind == "angle":
         degrees = wrap(values) * (180 / math.pi)

@@ -95,8 +95,8 @@ class SeveralModels(ABC):
 class SelfTraining(ABC):
     """Additional base class of a wrapper that trains its models itself, on training and validation split together.
 
-    The wrapper must divide the samples itself, such that each is also predicted by models that did not see it. Settings
-    of the trainer and the optimiser have no effect, and objectives are refused.
+    The wrapper must divide the samples itself, so that each sample can be predicted by models that did not see it.
+    Settings of the trainer and the optimiser have no effect, and objectives are refused.
 
     Attributes:
         rows: for each sample of the next prediction, its number among the samples that trained the models, (batch,);

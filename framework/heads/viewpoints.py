@@ -24,7 +24,7 @@ VOLUME = 8 * math.pi**2
 CHART = ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2), (-math.pi, math.pi))
 """Ranges of azimuth, elevation and tilt, radians. Each rotation has one viewpoint in the chart; the poles have many."""
 SUMMITS = 6
-"""Number of maxima on a grid, the highest ones, near which the mode of one angle's density is searched."""
+"""Number of the highest maxima on a grid, near which the mode of one angle's density is searched."""
 
 
 def log_volume(elevation: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:

@@ -225,7 +225,7 @@ def _renderer_of(config: Config) -> dict[str, Any]:
 
 
 def _refuse_idle_options(config: Config, options: RenderOptions) -> None:
-    """Refuse options of the mode that have no effect beside the other ones."""
+    """Refuse options of the mode that have no effect because of other options."""
     idle: dict[str, str] = {}
     if options.files is None:
         idle |= dict.fromkeys(OF_FILES, "only scenes of mode.files have this option")

@@ -55,7 +55,7 @@ def results_table(
     """Return a table for the terminal.
 
     Each result is a line. If the table would be wider than WIDTH characters, each result is a column instead, unless
-    that table would be even wider.
+    the table would then be even wider.
 
     Args:
         rows: the results, one per row.

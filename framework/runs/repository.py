@@ -61,9 +61,9 @@ def git_commit(folder: Path) -> dict[str, str]:
     """Return the `commit` of the repository around a folder, and whether tracked files differ from it (`dirty`).
 
     `commit` has 40 or 64 hexadecimal digits; `dirty` is "true" or "false". The result is empty if the folder is in no
-    repository, in a repository without a commit, or in a repository of another user that the user's own
-    `safe.directory` does not list. `dirty` is absent if git is missing, takes too long, or would have to run a filter
-    program to compare the files. Submodules are not inspected.
+    repository or in a repository without a commit. It is also empty if the repository belongs to another user and the
+    configuration of this user does not list it under `safe.directory`. `dirty` is absent if git is missing, takes too
+    long, or would have to run a filter program to compare the files. Submodules are not inspected.
     """
     try:
         repository = _repository(folder.resolve(strict=True))

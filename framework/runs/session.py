@@ -268,7 +268,7 @@ def refuse_unread_outliers(config: Config, parts: Resolved) -> None:
 
 
 def _require_whole_training(predictor: Predictor, config: Config) -> None:
-    """Refuse settings with which a wrapper of class `FollowsTraining` would not see the training to its end.
+    """Refuse settings with which a wrapper of class `FollowsTraining` would not see the whole training.
 
     Raises:
         ConfigError: Training may stop early, keeps the weights of another epoch than the last, or has no planned number

@@ -1,7 +1,7 @@
 """Reader for files of `torch.save` that admits plain values and dense tensors only.
 
-`torch.load(weights_only=True)` runs no code. It does, however, build sparse, nested and quantised tensors without
-checking their internal arrays, storages of any size, and tensors that repeat one stored number millions of times. The
+`torch.load(weights_only=True)` runs no code. It does, however, build storages of any size, tensors that repeat one
+stored number millions of times, and sparse, nested and quantised tensors, whose internal arrays it does not check. The
 pickle is therefore inspected before torch reads it, and the tensors are inspected afterwards.
 """
 

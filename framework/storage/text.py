@@ -303,7 +303,7 @@ def require_numbers_in(words: Sequence[str], text: str, first: int = 0) -> list[
 def describe_no_number(word: str, where: str = "") -> str:
     """Return the error message for a word that is not a number, with a correction if there is one.
 
-    `where` is the text in the message that follows the word and says where it stands.
+    `where` says where the word stands; the message contains this text after the word.
     """
     remedy = suggest_number(word)
     why = f", which is a number {remedy.form}; write {remedy.number}" if remedy else ""

@@ -320,9 +320,9 @@ class _Fork(LocalProcess):
 
 
 def _adopt_orphans() -> None:
-    """Make this process the new parent of processes whose parent, a descendant of this one, dies (Linux only).
+    """Make this process the parent of each of its descendants whose own parent dies (Linux only).
 
-    This process then observes their end.
+    This process then observes the end of these descendants.
     """
     ctypes.CDLL(None).prctl(_SET_CHILD_SUBREAPER, 1)
 

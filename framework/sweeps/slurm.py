@@ -39,7 +39,7 @@ _UNLISTED = "UNLISTED"
 _LOST = ("NODE_FAIL", "BOOT_FAIL", "PREEMPTED", "FAILED (JobLaunchFailure)")
 """States, some with their reason, of a job that ended through no fault of its own.
 
-SLURM gives the reason JobLaunchFailure to a job that its node could not launch, and to a job whose batch script was
+SLURM gives the reason JobLaunchFailure in two cases: the node could not launch the job, or the job's batch script was
 killed by a signal that SLURM was not asked to send. The script only starts `srun`; a job that is killed for its memory,
 its time or by its user has another state.
 """

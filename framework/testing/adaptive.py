@@ -415,8 +415,8 @@ def _integrands_near_peaks(mapping: _Map, low: Tensor, high: Tensor, peak_coordi
 
     A probe is a kind of such points. The first probe is the point of the box that is nearest to a peak. Densities of
     two numbers have two more probes: one coordinate is that of the nearest point, and the other is the middle of the
-    box. These detect a ridge, which is a peak that is narrow in one number and broad in the other, and which also
-    crosses boxes that contain no peak.
+    box. These detect a ridge: a peak that is narrow in one number and broad in the other. A ridge also crosses boxes
+    that contain no peak.
 
     Args:
         mapping: Map from coordinates to values.

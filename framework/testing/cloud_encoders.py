@@ -28,7 +28,7 @@ def different_clouds(points: int, columns: int) -> list[Tensor]:
 
 
 def batch_of(lengths: Sequence[int], columns: int = 3, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Return padded random clouds, far from the origin, which are equal in every dtype up to rounding.
+    """Return padded random clouds, not centred at the origin, which are equal in every dtype up to rounding.
 
     Args:
         lengths: Number of points of each cloud.

@@ -108,7 +108,7 @@ def skipped_files(bench: Workbench, worst: Worst) -> None:
 
 
 def own_files(bench: Workbench, worst: Worst) -> None:
-    """Check that user files are read without `prepare` and in the given order, as samples like those of the splits."""
+    """Check that user files are read in order and without `prepare`, into samples like those of the splits."""
     files, data = _user_files(bench)
     unknown = [file.name for file in files if data.suffixes and file.suffix.lower() not in data.suffixes]
     worst.count(bool(unknown), f"`suffixes` lacks the suffix of {', '.join(unknown)}")

@@ -72,7 +72,9 @@ def check_targets_belong(data: Data, worst: Worst) -> None:
 
 
 def _error(targets: Tensor, near: Tensor) -> Tensor:
-    """Return the squared error of predicting each target by the median target of its neighbours, (samples,).
+    """Return twice the squared error of predicting each target by the median target of its neighbours, (samples,).
+
+    For neighbours that say nothing about the target, this is about the squared distance of two random targets.
 
     Args:
         targets: Targets as numbers, (samples, number).

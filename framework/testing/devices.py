@@ -267,7 +267,7 @@ def check_devices(make_calls: Callable[[OneDevice], Calls], worst: Worst) -> Non
 
 
 def _perform(mode: OneDevice, call: Callable[[], Any]) -> None:
-    """Perform a call with labels; record a fault if it raises an error that it does not raise without labels."""
+    """Perform a call with labels; record a fault if it raises an error only with labels."""
     error_message = ""
     for labelled in (True, False):
         seed(SEED)

@@ -208,7 +208,7 @@ def _all_image_parts(encoder: Encoder, batch: Tensor, worst: Worst) -> None:
 
 
 def _repeatable(encoder: Encoder, make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """Check that features of the same inputs are equal after other inputs, and that evaluation changes no state."""
+    """Check that inputs have the same features after other inputs were encoded, and that evaluation keeps the state."""
     with torch.no_grad():
         batch = inputs(3)
         before = {name: value.clone() for name, value in _state(encoder).items()}

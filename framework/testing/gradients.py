@@ -27,10 +27,9 @@ def gradient(subject: HeadSubject, worst: Worst) -> None:
 
     The derivatives are compared with central differences for each item of the batch, at random targets and at draws. Of
     three step lengths, the one with the smallest error counts, since a small step suffers from rounding and a large one
-    may cross a kink. If all three disagree, three smaller steps follow, which resolve a narrow density. Then the
-    central difference counts that is closest to the one with the previous step length, whatever its error is. A
-    derivative that agrees with the one-sided difference to the left or to the right is right too, since the loss may
-    have a kink at the target.
+    may cross a kink. If all three disagree, three smaller steps follow, which resolve a narrow density. A derivative
+    then also passes if it agrees with the least uncertain of the six differences (`most_certain`), or with a one-sided
+    difference of one of the first three steps, since the loss may have a kink at the target.
     """
     head = subject.make().double().train()
     for size in (0.1, 1.0, 3.0, 30.0, 1e3):

@@ -26,7 +26,7 @@ from framework.testing.surface_checks import barycentric, gradient, normal, text
 
 Make = Callable[[], Renderer]
 OF_TRIANGLES = {"no holes", "sphere: depth, metres", "faces cut by the near plane", "extreme scenes"}
-"""Properties that are left out for a renderer of point sets, if its row leaves out "no faces, only background"."""
+"""Properties that are not checked for a renderer of point sets whose row leaves out "no faces, only background"."""
 
 
 def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:

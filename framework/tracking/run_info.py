@@ -69,7 +69,7 @@ class RunInfo:
     """Status of the run: RUNNING, FINISHED, FAILED or KILLED."""
     experiment_id: str | None = None
     sent: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Number of the last journal line such that the store has this line and all lines before it."""
+    """Number of the last journal line up to which the store has all lines."""
     replay_after: Annotated[int, Field(ge=0, lt=2**63)] | None = None
     """Step from which the run was last resumed; the run repeats the steps after it."""
     replay_until: dict[str, int] = field(default_factory=dict)

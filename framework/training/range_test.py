@@ -223,8 +223,8 @@ def suggest(rates: list[float], losses: list[float]) -> RangeTestResult:
     """Return the learning rate at which the loss falls fastest with the logarithm of the rate.
 
     The slope at a step is that of a line fitted by least squares to the losses of the 2 · HALF_WINDOW + 1 steps around
-    it. Only rates up to the one with the lowest mean loss of these steps are considered, and only slopes that are
-    negative by at least CERTAIN standard errors.
+    it. A rate is considered if its slope is at least CERTAIN standard errors below 0, and if the rate is at most that
+    with the lowest mean loss of these steps.
 
     Args:
         rates: learning rates, ascending by a constant factor.
