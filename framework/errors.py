@@ -46,7 +46,7 @@ def _written_out(letter: re.Match[str]) -> str:
 
 
 def _sentence(message: str, kind: type[UserError]) -> str:
-    """Return the error's message, extracted from the text that `torch._utils.ExceptionWrapper` makes of the error."""
+    """Return the message of an error of class `kind`, given the text that torch's `ExceptionWrapper` makes of it."""
     if not re.match(r"Caught \w+ in .*\.\nOriginal Traceback \(most recent call last\):\n", message):
         return message
     # The trace of an error that was raised from another one follows the other's trace.

@@ -36,7 +36,7 @@ _NAMES = {
 }
 """Names that a pickle may use, by module."""
 ALLOWED = {(module, name): name for module, names in _NAMES.items() for name in names}
-"""Names (module, name) that a pickle may use, and the kind of object that each one stands for in this module."""
+"""Names that a pickle may use, as (module, name), and the `kind` of the `_Record` that is made of each."""
 SPARSE = re.compile(r"(csc|csr|coo)_(matrix|array)")
 DTYPE = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248]|c(8|16)|[SU]\d{1,4})")
 DEEPEST = 40

@@ -55,7 +55,7 @@ def _add_trainer_keys(arguments: list[str]) -> list[str]:
 
 
 def _name_callbacks(arguments: list[str]) -> list[str]:
-    """Replace `trainer.callbacks=[a,b]` by a mapping, so that `trainer.callbacks.a.key=value` can set a key of it.
+    """Replace `trainer.callbacks=[a,b]` by a mapping, so that `trainer.callbacks.a.key=value` can set a key of `a`.
 
     Raises:
         ConfigError: There is no such callback, or it cannot be chosen.

@@ -243,7 +243,7 @@ class GradientAccumulationSettings(_Strict):
     """Numbers of batches whose gradients are averaged for one optimiser step, by epoch."""
 
     batches: Annotated[dict[NotNegative, Count], Field(min_length=1)]
-    """Number of batches of an optimiser step, by the epoch (from 0) from which on it holds.
+    """Number of batches of an optimiser step from an epoch on, by this epoch, counted from 0.
 
     Before the first of these epochs a step has one batch.
     """

@@ -144,8 +144,8 @@ class Frozen:
     def _features(self, inputs: Any) -> tuple[Any, Network | None, Frame | None]:
         """Return the features, the network that reads them, and the map from predictions to the user's unit (`Frame`).
 
-        The network is None if torch computes the raw parameters; the features are then a tensor, and otherwise an array
-        (batch, length). The map is None if predictions are in the user's unit already.
+        If torch computes the raw parameters, the network is None and the features are a tensor. Otherwise the features
+        are an array (batch, length). The map is None if predictions are in the user's unit already.
         """
         frame = None
         if self.data is not None:

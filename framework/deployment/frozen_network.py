@@ -267,7 +267,7 @@ class _Reader:
         return Network(self.steps, result.register, np.dtype(np.float64))
 
     def _signal(self, node: Node, name: str) -> Signal:
-        """Return the value of a node; add a step to the network if the node needs one."""
+        """Return the value of a node, whose operation is `name`; add a step to the network if the node needs one."""
         arguments: Any = node.args
         if name == "cat":
             return self._concatenate(arguments[0], arguments[1:])

@@ -1,4 +1,4 @@
-"""Loading of a trained model in Python (`framework.load`); with a budget, its knobs are set such that it meets it."""
+"""Loading of a trained model in Python (`framework.load`); with a budget, the model's knobs are set to meet it."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace

@@ -30,13 +30,13 @@ from framework.errors import UserError
 DRAWS = 9999
 """Number of draws from which an interval is computed if the distribution function of its density is not known.
 
-If an interval between two draws is to have the probability 0.9, its true probability then has a standard error of
-0.003.
+The true probability of an interval that is computed from the draws for the probability 0.9 then has a standard error
+of 0.003.
 """
 ROUNDS = 200
-"""Largest number of steps in which a bracket is narrowed; the search normally ends earlier, at a width of EXACT."""
+"""Largest number of steps in which a bracket is narrowed; the search normally ends earlier, because of EXACT."""
 EXACT = 1e-12
-"""Width of a bracket at which the search ends, as a multiple of its distance from the middle of the density."""
+"""Width of a bracket at which the search ends, as a multiple of its distance from `find_crossing`'s `center`."""
 AROUND = 24
 """Number of equally spaced angles at which the search for the median of an angle starts, besides those near peaks."""
 RUNGS, NARROWER = 16, 8.0
@@ -207,8 +207,8 @@ def find_crossing(
         level: the value that the function reaches.
         low: lower end of a bracket of x.
         high: upper end of the bracket.
-        center: reference point. The search ends where the bracket is as narrow as EXACT times its distance from this
-            point, or where its ends are neighbouring floating-point numbers.
+        center: reference point. The search ends where the bracket is as narrow as EXACT times the bracket's distance
+            from this point, or where its ends are neighbouring floating-point numbers.
     """
     level, low, high = torch.broadcast_tensors(level, low, high)
     a, b = high, low

@@ -71,7 +71,7 @@ class Knobs:
     def settings(self) -> list[Setting]:
         """Return all combinations of values of the knobs.
 
-        The values of a knob are those that its part of the predictor declares, and its present value.
+        A knob takes the values that its part of the predictor declares, and its present value.
         """
         present = self.current
         return list(

@@ -118,7 +118,7 @@ class Middle:
         self.first = self.sum = torch.zeros(3, dtype=torch.float64)
 
     def add(self, chunk: Float[Tensor, "points columns"]) -> None:
-        """Add the points of a chunk to the mean."""
+        """Include the points of a chunk in the mean."""
         points = finite_points(chunk)
         if len(points) == 0:
             return
