@@ -138,7 +138,7 @@ def draw(rows: Sequence[Mapping[str, Any]], title: str, path: Path, *, synthetic
 
 
 def conclusion(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return a sentence about the methods whose accuracy is within its error of the highest one."""
+    """Return a text on the methods whose accuracy equals the highest one within the standard error."""
     best = max(rows, key=lambda row: row["accuracy"])
     near = [
         row

@@ -107,7 +107,10 @@ def table(columns: dict[str, Callable[[str], float | None]]) -> list[str]:
 
 
 def time_masks(name: str) -> str:
-    """Return the row of an encoder: milliseconds per sample, and speed-up over predictions with one mask each."""
+    """Return the table row of an encoder with MC dropout, with a cell for each number of masks.
+
+    A cell holds milliseconds per sample, and the speed-up over as many predictions with one mask.
+    """
     shape, encoder = ENCODERS[name]
     inputs = torch.randn(BATCH, *shape)
 

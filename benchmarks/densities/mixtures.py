@@ -26,7 +26,7 @@ COMPONENTS = (5, 100)
 MODES = (1000, 3000, 10_000, 30_000)
 """Numbers of components whose mode is searched."""
 MOST_PAIRS = 10_000
-"""Largest number of components for which all pairs are evaluated."""
+"""Largest number of components for which every component is evaluated at the mode of every component."""
 OURS = {"von Mises": VonMises, "normal": Gaussian}
 THEIRS = {"von Mises": torchs.VonMises, "normal": torchs.Normal}
 
@@ -109,7 +109,7 @@ def mixture_of(kind: str, count: int) -> Mixture:
 
 @torch.no_grad()
 def highest_of_all_modes(mixture: Mixture) -> Tensor:
-    """Return the log-density at the highest of the modes of all components, from all pairs."""
+    """Return the highest log-density of a mixture at the modes of its components."""
     return mixture.log_prob(mixture.components.mode.movedim(-2, 0)).max()
 
 

@@ -69,9 +69,9 @@ def median_seconds(calls: Sequence[Callable[[], object]]) -> list[float]:
 
 
 def cost_at(error: float, errors: Sequence[float], costs: Sequence[float]) -> float:
-    """Return the cost at which a curve of fixed numbers reaches an error, by interpolation of logarithms.
+    """Return the cost at which a fixed number of points would reach an error, by interpolation of logarithms.
 
-    It is NaN if the error is outside the curve.
+    It is NaN if the error is outside of the measured `errors`.
     """
     order = np.argsort(errors)
     known, cost = np.log(np.asarray(errors)[order]), np.log(np.asarray(costs)[order])
@@ -195,7 +195,7 @@ def conclusion(rows: Sequence[Row]) -> str:
 
 
 def compare_points(rows: Sequence[Row]) -> str:
-    """Return the sentence that compares both kinds of points where both use nearly the fewest points."""
+    """Return the text that compares the errors with the fewest fixed points and with the largest tolerance."""
     parts = []
     for method in dict.fromkeys(row.method for row in rows):
         fixed = next(row for row in rows if row.method == method and row.knob == "samples")

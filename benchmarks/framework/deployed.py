@@ -91,7 +91,7 @@ class Arrays(Data):
     prepare = splits = read = augment = fingerprint = preview = None  # type: ignore[assignment]
 
     def preprocessing(self) -> Preprocessing | None:
-        """Return None: arrays are inputs."""
+        """Return None: arrays are inputs already."""
         return None
 
 

@@ -24,7 +24,7 @@ from benchmarks.timing import ROUNDS, median_and_range
 
 RUN = ("experiment=moons/vanilla_128", "debug=fast", "pictures=false", "threads=1")
 FEW, MANY = 4, 16
-"""Numbers of jobs of two sweeps; the cost of a job is their difference."""
+"""Numbers of jobs of two sweeps; the cost of a job is the difference of their times for each additional job."""
 STORED = (1_000, 10_000)
 """Numbers of runs of a store."""
 FILES = 100_000

@@ -161,7 +161,7 @@ async def send_once(port: int, request: bytes) -> tuple[int, bytes, float]:
 
 
 def malformed(good: Body, generator: random.Random) -> Body:
-    """Return a request that no model can answer."""
+    """Return a random malformed request, or a valid one whose bytes are changed at random."""
     deep = generator.randrange(20, 100_000)
     text = good.content
     cut = text[: generator.randrange(len(text))]

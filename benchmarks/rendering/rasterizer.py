@@ -1,4 +1,7 @@
-"""Measure the run time of the renderer rasterizer, its savings, batches and growth, and that of other renderers.
+"""Measure the run time of the renderer rasterizer, and compare it with other renderers.
+
+The page also says how much time each saving of the rasteriser saves, how fast batches are, and how the time grows with
+the numbers of faces and pixels.
 
     python -m benchmarks.rendering.rasterizer
 

@@ -71,8 +71,8 @@ def differences(images: Images, scenes: list[Scene]) -> tuple[dict[str, list[Ten
     """Compare each image with the next one.
 
     Returns:
-        For each way to draw, the difference of each pair of images, (height, width), which is NaN at pixels whose point
-        is not visible in both images; and for each pair the mask of the other pixels.
+        For each way to draw, the difference of each pair of images, (height, width), NaN at pixels that cannot be
+        compared; and for each pair the mask of the pixels that can, because their point is visible in both images.
     """
     renderer = build_renderer("rasterizer")
     rendered_channels = [renderer(scene, flow.CHANNELS) for scene in scenes]

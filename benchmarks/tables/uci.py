@@ -34,7 +34,7 @@ TARGETS = {"concrete": -2.80, "energy": -0.49, "kin8nm": 1.33, "yacht": 0.40}
 """Mean test log-likelihoods that the recommended start shall reach, nats."""
 TIMES = ("sweep_seconds", "microseconds", "point_microseconds")
 COVERED, LONGEST, SLOWEST = (0.88, 0.95), 180, 10
-"""Limits of the share of test rows in the 90 % region, of the wall time of 20 runs in s, and of a density in µs."""
+"""Limits of the share of test rows in the 90 % region, the wall time of 20 runs (s), and the time of a density (µs)."""
 TIMED = 5
 """Number of splits whose models are timed."""
 LARGE, FEW, SLOW = 5000, 5, ("NGBoost", "scikit-learn random forest")
@@ -156,7 +156,7 @@ def peers(root: Path, name: str) -> None:
     from framework.configuration.schema import build, resolve
 
     def constant(model: Callable[[], Any]) -> Callable[..., tuple[Any, Any]]:
-        """Return a fit of a model of the mean, with a normal density whose deviation is that of held-out rows."""
+        """Return a function that fits a model to the mean of a normal density, and its deviation to held-out rows."""
 
         def fit(inputs: Any, target: Any, new: Any) -> tuple[Any, Any]:
             own, held_out, own_target, held_out_target = train_test_split(

@@ -228,8 +228,8 @@ def page() -> None:
 def curve(rows: list[dict[str, Any]], name: str, method: str) -> list[dict[str, float]]:
     """Return means of a method on a set for each knob value, in ascending order of the value.
 
-    Each has the log-likelihood with its standard error, the gain over one model with that of the paired differences,
-    and the time.
+    Each holds the log-likelihood and its standard error, the gain over one model and the standard error of this paired
+    difference, the time, and the AUROC (NaN without outliers).
     """
     plain = (name, "one model")
     base = {row["run"]: row["log_likelihood"] for row in rows if (row["data"], row["method"]) == plain}

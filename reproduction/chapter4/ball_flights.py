@@ -117,9 +117,9 @@ def draw_ranks(model: Model, batch: dict[str, torch.Tensor]) -> tuple[Prediction
 def evaluate_flights(model: Model, data: Data) -> FlightErrors:
     """Evaluate a model on the test split, with intervals that are calibrated on the validation split.
 
-    For each coordinate and frame, the calibrated interval is the middle share of the samples that holds the true value
-    of 90 % of the validation windows (distributional conformal prediction: Chernozhukov, Wüthrich & Zhu 2021). The
-    interval has the same coverage on the test split if windows are exchangeable.
+    For each coordinate and frame, the calibrated interval is a central range of the samples. Its share of the samples
+    is such that it holds the true value in 90 % of the validation windows (distributional conformal prediction:
+    Chernozhukov, Wüthrich & Zhu 2021). It has the same coverage on the test split if windows are exchangeable.
     """
     torch.manual_seed(0)
     metric = FlightError(data.target)

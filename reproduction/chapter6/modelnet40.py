@@ -111,9 +111,9 @@ def accuracy_gain(first: str, second: str) -> dict[str, float]:
 
 
 def extra_loss(grid: str, other: str) -> dict[str, float]:
-    """Return the weights of the accuracies whose sum says how much more accuracy `other` loses than `grid`.
+    """Return weights of accuracies, with which their weighted sum is the loss of `other` minus the loss of `grid`.
 
-    The loss is the accuracy with 32³ cells or basis points minus the accuracy with 8³.
+    A loss is the accuracy with 32³ cells or basis points minus the accuracy with 8³.
     """
     return {f"{other}_32": 1.0, f"{other}_8": -1.0, f"{grid}_32": -1.0, f"{grid}_8": 1.0}
 

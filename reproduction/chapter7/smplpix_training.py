@@ -58,7 +58,8 @@ class Row:
 
     Attributes:
         seeds: Number of seeds that ran.
-        minutes: Number of epochs times the shortest epoch of all runs, because the machine also did other work.
+        minutes: Minutes of a training: the number of epochs times the duration of the shortest epoch of all runs. The
+            shortest is taken because the machine also did other work.
         means: Means over seeds, by key of `COLUMNS`.
         spreads: Standard deviations over seeds, by key of `COLUMNS`; NaN for one seed.
         measured: Machine and date.
