@@ -60,7 +60,7 @@ class Sheet:
         corners: triangles of the body, and then the triangles after each stage.
         pairs: for each stage, the two ends of each split edge. The midpoints of these edges, in this order, are
             appended to the vertices.
-        uv_pairs: for each stage, the two ends of each split edge between texture coordinates.
+        uv_pairs: the same for edges between texture coordinates.
     """
 
     corners: tuple[Corners, ...]

@@ -99,8 +99,8 @@ def in_quotes(text: str) -> str:
 def plain(config: DictConfig) -> dict[str, Any]:
     """Return the composed config as plain values with interpolations resolved.
 
-    Entries of a group that have no `name` are dropped. Such an entry remains, for example, if an experiment sets keys
-    of `encoder.a`, and the command replaces this encoder by `encoder=b`.
+    In the groups `PLURAL`, entries without a `name` are dropped. Such an entry remains, for example, if an experiment
+    sets keys of `encoder.a`, and the command replaces this encoder by `encoder=b`.
 
     Raises:
         ConfigError: A required value is missing, or an experiment's keys are not at the top level.

@@ -314,7 +314,7 @@ class ModelNoise:
         }
 
     def entry(self) -> dict[str, Any]:
-        """Return the entry of these random numbers in density.json."""
+        """Return the fields of `ModelNoise` as plain values, as density.json contains them."""
         dtype = str(self.dtype).removeprefix("torch.")
         return {"name": self.name, "kind": self.kind, "shape": list(self.shape), "dtype": dtype}
 
@@ -556,7 +556,7 @@ def _difference(computed: np.ndarray, expected: np.ndarray) -> float:
 
 
 def _write_code(modules: list[str], folder: Path) -> list[str]:
-    """Copy the scripts and the NumPy code of the families, and return the names of the modules with families."""
+    """Copy the scripts and the NumPy code of the densities, and return the names of the modules of densities."""
     names = {path: "densities" if path == NUMPY else path.rpartition(".")[2] for path in (NUMPY, *modules)}
     scripts = Path(str(exported_folder.__file__)).parent
     # the scripts are not imported here, because they need packages of the exported folder

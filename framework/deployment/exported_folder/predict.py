@@ -277,7 +277,7 @@ def _require_bytes(array: NDArray[Any]) -> None:
 
 
 def _require_finite(array: NDArray[Any], name: str) -> None:
-    """Raise an error that names the first row with a number that is not finite."""
+    """Raise an error if a number of the array `name` is not finite; the message names the first such row."""
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         row = int((~np.isfinite(array.reshape(len(array), -1)).all(1)).argmax())
         raise ValueError(f"The {name} of row {row} are not finite. Correct the input.")
