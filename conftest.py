@@ -31,6 +31,11 @@ if os.environ.get("CHECK_TYPES", "0") != "0":
     install_import_hook(["framework", "plugins"], "beartype.beartype")
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """Return one worker more than cores for `pytest -n logical`: tests wait for a tenth of their time."""
+    return (os.cpu_count() or 1) + 1
+
+
 @pytest.fixture(autouse=True)
 def no_store_in_the_environment() -> Iterator[None]:
     """MLflow leaves the address of the store that it last served in the environment; the next test would log there."""

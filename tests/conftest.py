@@ -1,6 +1,5 @@
 """Fixtures that run the command line as a user does: in a separate folder, with a third-party package installed."""
 
-import gc
 import json
 import os
 import select
@@ -44,16 +43,6 @@ TINY = [
     "pictures=false",
 ]
 """Settings of a run of 27 steps (9 in each epoch) on the third-party data, half a second long after its imports."""
-
-
-def pytest_collection_finish() -> None:
-    """Exempt all that importing and collecting has made from garbage collection.
-
-    These are millions of objects that live until the end. Walking through them took more than a quarter of the
-    processor time of tests that compose configs.
-    """
-    gc.collect()
-    gc.freeze()
 
 
 def imported_by(module: str) -> set[str]:
