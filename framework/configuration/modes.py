@@ -1,4 +1,4 @@
-"""Keys of a config that each mode reads; a command that sets other keys is refused (DESIGN, law 11)."""
+"""Keys of a config that each mode reads; a command that sets other keys is refused."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

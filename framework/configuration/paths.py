@@ -1,4 +1,4 @@
-"""Handling of paths in a stored config, which are used only if the user repeats them (DESIGN, law 15).
+"""Handling of paths in a stored config, which are used only if the user repeats them (SECURITY.md).
 
 The reason is that a checkpoint or a run folder may come from an untrusted source. A text counts as a path if the
 annotation of its parameter says so (`FilePath`, `pathlib.Path`, pydantic's `FilePath` and `DirectoryPath`). Without

@@ -1,4 +1,4 @@
-"""Frames of scene files: every file seen by the same kind of camera, with true images if the user has them."""
+"""Frames of scene files: the same view of the subject of every file, with true images if the user has them."""
 
 import math
 from collections.abc import Iterator, Sequence

@@ -263,7 +263,7 @@ def _trade_off(compared: Comparison, figure: "Figure | None") -> str:
 
 
 def _figures(compared: Comparison) -> str:
-    """Return the figures of the first run of each row."""
+    """Return, as HTML, the figures of the first run of each row of the table."""
     left, parts, omitted = LARGEST_PAGE * 3 // 4, [], 0  # base64 makes four bytes of three
     for name, row in zip(row_names(compared), compared.rows, strict=True):
         run = next(iter(_by_seed(compared, row).values()))

@@ -20,7 +20,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from framework.testing.finding import SEED, TooSlow, Worst, seed
 
 DEVICE = torch.device("cpu", 0)
-"""Device that `tensor.device` returns for a tensor labelled as on the device.
+"""Device that `tensor.device` returns for a tensor with the label "on the device", as if it were on a GPU.
 
 Torch computes on the CPU with it, but it differs from `torch.device("cpu")`, which other tensors return.
 """
@@ -57,7 +57,9 @@ _on_device: Any = WeakTensorKeyDictionary()
 
 
 class OneDevice(TorchFunctionMode):
-    """Context manager that records calls that mix tensors on the device with tensors on the CPU.
+    """Context manager that records calls that would mix tensors on a GPU with tensors on the CPU.
+
+    Tensors with the label "on the device" are treated as if they were on a GPU.
 
     Attributes:
         faults: Descriptions of the calls, with file and line and the tensors; no description occurs twice.
@@ -68,7 +70,7 @@ class OneDevice(TorchFunctionMode):
         self.faults: list[str] = []
 
     def label_device(self, value: Any) -> Any:
-        """Label every tensor in a value and its nested containers as on the device, and return the value."""
+        """Give the label "on the device" to every tensor in a value or its nested containers; return the value."""
         for tensor in tensors_in(value):
             _on_device[tensor] = True
         return value
@@ -87,7 +89,7 @@ class OneDevice(TorchFunctionMode):
                 part._device = DEVICE  # type: ignore[assignment]
 
     def label_cpu(self, value: Any) -> None:
-        """Label every tensor in a value, such as an attribute that `Module.to` does not move, as on the CPU."""
+        """Give the label "on the CPU" to all tensors in a value, such as an attribute that `Module.to` does not move."""
         for tensor in tensors_in(value):
             _on_device[tensor] = False
 
@@ -201,7 +203,7 @@ class OneDevice(TorchFunctionMode):
         return result
 
     def _label_on_cpu(self, result: Any) -> None:
-        """Label tensors as on the CPU, unless a calling function has separate code for each kind of device."""
+        """Give tensors the label "on the CPU", unless a calling function has separate code for each kind of device."""
         tensors = [tensor for tensor in tensors_in(result) if _on_device.get(tensor) is not False]
         if tensors and not _has_device_code():
             for tensor in tensors:
@@ -305,7 +307,7 @@ def _is_device(chosen: Any) -> bool:
 
 
 def _label_constants(packages: set[str]) -> None:
-    """Label global tensors in the modules of the packages as on the CPU, since no call moves them."""
+    """Give the label "on the CPU" to global tensors in the modules of the packages, since no call moves them."""
     for name, module in list(sys.modules.items()):
         if name.partition(".")[0] in packages:
             for value in list(vars(module).values()):

@@ -42,7 +42,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Row:
-    """Base of the rows; these are the attributes of all rows.
+    """Base class of contract rows, with the attributes that all rows have.
 
     Attributes:
         name: Description that distinguishes the row from the plugin's other rows.

@@ -21,7 +21,7 @@ Result = TypeVar("Result")
 UNITS = ((200.0, 50.0), (0.3, 1e-5))
 """Two pairs of location and scale, which the numbers of a target have alternately.
 
-The numbers may be heights in centimetres and wavelengths in metres.
+For example, a target may contain a height in centimetres and a wavelength in metres.
 """
 TOLERANCE = 1e-5
 """Largest relative error that passes."""

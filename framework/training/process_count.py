@@ -11,9 +11,9 @@ INTERACTIVE = ("bash", "interactive")
 """Names of SLURM jobs in which Lightning starts the processes itself, because a person types the commands."""
 
 OTHER_LAUNCHERS = ("MASTER_ADDR", "LSB_JOBID", "OMPI_COMM_WORLD_SIZE", "PMI_SIZE")
-"""Environment variables that show that the processes on all nodes are started by hand or by another launcher.
+"""Environment variables that show how the processes on all nodes were started, if not by torchrun or srun.
 
-At least one of them is set in this case. Other launchers are those except torchrun and srun.
+If they were started by hand or by another launcher, at least one of the variables is set.
 """
 
 

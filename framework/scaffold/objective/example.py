@@ -1,4 +1,4 @@
-"""The training loss at inputs with noise."""
+"""Example of an objective: the training loss at noisy inputs."""
 
 from typing import Annotated
 
