@@ -32,7 +32,7 @@ DISTANCE = 2.6  # metres
 CHANNELS = (("mask",), ("depth",), ("color",), ("color", "depth"))
 LEARNED = ("vertices", "colors")
 ALONE = ("view", "box")
-"""Savings that do not depend on the previous image."""
+"""Default savings that do not depend on the previous image."""
 SCENES = 32
 ROUNDS = 8
 FIRST_CALL = """
