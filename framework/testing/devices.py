@@ -89,7 +89,7 @@ class OneDevice(TorchFunctionMode):
                 part._device = DEVICE  # type: ignore[assignment]
 
     def label_cpu(self, value: Any) -> None:
-        """Give the label "on the CPU" to all tensors in a value, such as an attribute that `Module.to` does not move."""
+        """Give all tensors in a value the label "on the CPU", such as an attribute that `Module.to` does not move."""
         for tensor in tensors_in(value):
             _on_device[tensor] = False
 
