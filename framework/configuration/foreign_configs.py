@@ -16,7 +16,7 @@ from framework.storage.plain_values import read_yaml
 OWN = ("hydra", "logger", "mode")
 """Parts of a config that only the user may set: they determine the command, the output folder and the store."""
 HARMLESS = {"hydra": ("sweeper", "launcher", "verbose"), "logger": ("name", "experiment"), "mode": ()}
-"""For each part in `OWN`, the keys that an added config folder may set; it may set no other key of these parts."""
+"""Keys that an added config folder may set in each part of `OWN`; it may set no other key of these parts."""
 LAUNCHERS = ("basic", "pool")
 """Launchers that an added config folder may choose; others reach other machines."""
 PART_KEYS = {
