@@ -24,10 +24,10 @@ LEAST, WIDEST = 1e-4, 1e3
 class LSTMHead(DensityHead):
     """LSTM over the observed and then the future frames (Hochreiter & Schmidhuber 1997; reference [121] of the thesis).
 
-    At each frame the network predicts the ball's displacement to the next frame, and the standard deviation of this
-    displacement. If the next frame is missing or in the future, the network reads the position that it predicted for
-    this frame. So errors accumulate with time, which this head is meant to demonstrate. The coordinates of a frame are
-    independent and normal; the head is trained by likelihood.
+    At each frame the network predicts the ball's displacement to the next frame. At each future frame it also predicts
+    the standard deviations of the coordinates of this frame. If the next frame is missing or in the future, the network
+    reads the position that it predicted for this frame. So errors accumulate with time, which this head is meant to
+    demonstrate. The coordinates of a frame are independent and normal; the head is trained by likelihood.
 
     Args:
         observed: number of frames of an input; the same value as in the config of the data.
@@ -89,7 +89,9 @@ class LSTMHead(DensityHead):
     def _next(
         self, place: Tensor, move: Tensor, visible: Tensor, state: tuple[Tensor, Tensor] | None
     ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
-        """Return the displacement to the next frame (batch, 3), its standard deviation, and the network's new state.
+        """Return the displacement to the next frame, standard deviations, (batch, 3) each, and the network's new state.
+
+        The standard deviations are those of the coordinates of the current frame, if it is a future frame.
 
         Args:
             place: position at the current frame, (batch, 3).

@@ -31,8 +31,8 @@ class CellDensity(ViewpointDensity):
 
     The cells are those of `framework.geometry.rotation_grid` and have equal volumes. With n cells and the probability w
     of the cell of a rotation R, the density is p(R) = n w with respect to the rotation-invariant measure of total mass
-    1. log_prob is with respect to da de dt in the chart -π/2 ≤ e ≤ π/2, log p(R) + log(cos e / 8π²), and exact: the
-    probabilities of the cells add up to 1. The density jumps between cells, and has no gradient in R within a cell.
+    1. log_prob is with respect to da de dt in the chart -π/2 ≤ e ≤ π/2: it is log p(R) + log(cos e / 8π²). It is exact,
+    since the probabilities of the cells add up to 1. The density p jumps between cells, and is constant within a cell.
 
     Args:
         log_weights: log of the probability of each cell, (*batch, cell), nats.
@@ -208,6 +208,6 @@ def _(density: CellDensity, index: Tensor) -> CellDensity:
 
 @tempered_density.register
 def _(density: CellDensity, temperature: Tensor) -> CellDensity:
-    """Return the density of rotations raised to the power 1/T; the chart's factor cos e stays as it is."""
+    """Return the density with p(R) replaced by p(R)^(1/T), normalised; the factor cos e / 8π² does not change."""
     log_weights = torch.log_softmax(density.log_weights.double() / temperature, -1)
     return CellDensity(log_weights.to(density.log_weights.dtype))

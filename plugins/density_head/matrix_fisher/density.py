@@ -75,7 +75,7 @@ def _(density: MatrixFisher) -> Exported:
 
 @uniform.register
 def _(density: MatrixFisher) -> MatrixFisher:
-    """Return the uniform density of rotations, Haar's measure, which is cos e / 8π² on the chart."""
+    """Return the uniform density of rotations: cos e / 8π² for azimuth, elevation e and tilt, with -π/2 ≤ e ≤ π/2."""
     return MatrixFisher(torch.zeros_like(density.parameter), density.dtype)
 
 
@@ -83,7 +83,6 @@ def _(density: MatrixFisher) -> MatrixFisher:
 def _(density: MatrixFisher, temperature: Tensor) -> MatrixFisher:
     """Return the density of rotations raised to the power 1/T for the temperature T, which has the parameter F/T.
 
-    The density of the viewpoint keeps the chart's factor cos e as it is, since this factor is not part of the
-    prediction.
+    The density of the viewpoint keeps its factor cos e / 8π², since this factor is not part of the prediction.
     """
     return MatrixFisher(density.parameter / temperature, density.dtype)

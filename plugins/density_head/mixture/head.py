@@ -22,10 +22,10 @@ Several components together can describe a uniform density, and each still learn
 class MixtureHead(DensityHead):
     """Finite mixture of densities of another head, with weights by softmax (thesis eq. 3.10-3.11).
 
-    The head reads K logits, then the raw parameters of K components, then one further set of raw parameters that is
-    added to each of the K. Through this set all components learn together what they have in common, and none falls
-    behind (README). A component that is fitted after training (it has a buffer) is refused, because it is not known
-    which samples belong to which component.
+    The head reads K logits, then the raw parameters of K components, then, if K > 1, one further set of raw parameters
+    that is added to each of the K. Through this set all components learn together what they have in common, and none
+    falls behind (README). A component that is fitted after training (it has a buffer) is refused, because it is not
+    known which samples belong to which component.
 
     Args:
         components: K. With 1 the density is the component, to the last bit.

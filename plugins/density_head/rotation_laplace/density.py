@@ -20,8 +20,8 @@ class RotationLaplace(MatrixDensity):
 
     A = U S Vᵀ is the proper singular value decomposition, and δ = `SOFTENING` makes the density finite at the mode.
     Near the mode, d is proportional to the angle from it, so that log p falls linearly and not quadratically. log_prob
-    is with respect to da de dt in the chart -π/2 ≤ e ≤ π/2, log p(R) + log(cos e / 8π²). An elevation outside the chart
-    is read as the viewpoint of the same rotation inside.
+    is with respect to da de dt in the chart -π/2 ≤ e ≤ π/2: it is log p(R) + log(cos e / 8π²). A viewpoint with an
+    elevation outside the chart is read as the viewpoint of the same rotation inside.
 
     Args:
         parameter: A, (*batch, 3, 3); 0 is the uniform density of rotations.
@@ -57,7 +57,7 @@ estimate.register(RotationLaplace, exact_estimate)
 
 @uniform.register
 def _(density: RotationLaplace) -> UniformViewpoints:
-    """Return the uniform density of rotations, which is cos e / 8π² on the chart."""
+    """Return the uniform density of rotations: cos e / 8π² for azimuth, elevation e and tilt, with -π/2 ≤ e ≤ π/2."""
     like = density.parameter.new_zeros((), dtype=density.dtype)
     return UniformViewpoints(like, density.batch_shape)
 

@@ -46,8 +46,9 @@ def squared_distance(
 ) -> Float[Tensor, "..."]:
     """Return d² = tr(S - AᵀR) + δ² for unit quaternions of R and parameters A, float64; batch shapes broadcast.
 
-    The trace is computed as Σ λᵢqᵢ², so that no digits cancel (λ and q are explained in the module's docstring). d² is
-    differentiable once; the derivative in `turn` is only valid for changes that keep the quaternion of unit length.
+    A = U S Vᵀ is the proper singular value decomposition, and δ is SOFTENING. The trace is computed as Σ λᵢqᵢ², so that
+    no digits cancel (λ and q are explained in the module's docstring). d² is differentiable once; the derivative in
+    `turn` is only valid for changes that keep the quaternion of unit length.
 
     Args:
         turn: unit quaternions of R.
@@ -57,7 +58,10 @@ def squared_distance(
 
 
 def log_normaliser(parameter: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
-    """Return log F(A), nats, with respect to the rotation-invariant measure of total mass 1; differentiable once."""
+    """Return the logarithm of the normaliser F(A) of the density exp(-d)/d, nats; it is differentiable once.
+
+    The density is with respect to the rotation-invariant measure of total mass 1.
+    """
     return _LogNormaliser.apply(parameter.double())
 
 

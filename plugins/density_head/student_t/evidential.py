@@ -29,9 +29,9 @@ class EvidentialHead(HeadOfReals):
     λ |y - γ| (2 ν + α) reduces the evidence for predictions that are wrong (eq. 9-10). The aleatoric variance is
     β / (α - 1), and the epistemic one is β / (ν (α - 1)); `evidence` returns γ, ν, α and √β.
 
-    For each number, the head reads four raw parameters. The first is γ itself. ν, α - 1 and √β are the positive
-    function `scale_of_raw` of the other three. If `Target` has the mean and the standard deviations of the training
-    targets, raw parameters describe the target minus this mean, in these standard deviations.
+    For each number, the head reads four raw parameters. The first is γ itself. ν - LEAST_EVIDENCE, α - LEAST_ALPHA and
+    √β are the positive function `scale_of_raw` of the other three. If `Target` has the mean and the standard deviations
+    of the training targets, raw parameters describe the target minus this mean, in these standard deviations.
 
     Args:
         evidence_weight: λ. The likelihood depends on ν and β only through one number, so that the penalty alone

@@ -43,10 +43,10 @@ def log_of_square_plus_one(u: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"
 
 
 def tail_of_whole(standard: Float[Tensor, "*shape"], freedom: int) -> Float[Tensor, "*shape"]:
-    """Return P(X > |z|) for z = `standard` and whole degrees of freedom ν ≥ 2, with an absolute error of 1e-15.
+    """Return P(X > |z|) for X of Student's t with whole degrees of freedom ν ≥ 2, with an absolute error of 1e-15.
 
-    With θ = atan(|z|/√ν), P(|X| ≤ |z|) is a polynomial in cos θ, times sin θ, plus 2θ/π for odd ν (Abramowitz & Stegun
-    1964, 26.7.3-4).
+    z is `standard`, and ν is `freedom`. With θ = atan(|z|/√ν), P(|X| ≤ |z|) is a polynomial in cos θ, times sin θ, plus
+    2θ/π for odd ν (Abramowitz & Stegun 1964, 26.7.3-4).
     """
     angle = torch.atan(standard.abs() / math.sqrt(freedom))
     sine, cosine = torch.sin(angle), torch.cos(angle)

@@ -104,9 +104,10 @@ class StudentTHead(HeadOfReals):
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Choose the degrees of freedom of each number and the factor of its scales, by their likelihood.
+        """Choose the degrees of freedom of each number and the factor of its scales, by their penalised likelihood.
 
-        Both are chosen from a grid that holds their values before calibration, so that the likelihood does not fall.
+        FACTOR_PRIOR and FREEDOM_PRIOR are the weights of the penalties. Both values are chosen from a grid that holds
+        their values before calibration, at which the penalties are 0, so that the likelihood does not fall.
         """
         if not self.calibrated:
             return

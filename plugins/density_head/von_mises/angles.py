@@ -18,7 +18,7 @@ _PI = tuple(
 
 
 def half_angle(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
-    """Return sin((φ-μ)/2) and cos((φ-μ)/2), computed without rounding of φ-μ.
+    """Return sin((φ-μ)/2) and cos((φ-μ)/2) for φ in `value` and μ in `mean`, without rounding of φ-μ.
 
     Both are correct up to one common sign.
     """
@@ -29,7 +29,7 @@ def half_angle(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def half_products(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
-    """Return sin²((φ-μ)/2) and sin((φ-μ)/2) cos((φ-μ)/2)."""
+    """Return sin²((φ-μ)/2) and sin((φ-μ)/2) cos((φ-μ)/2) for φ in `value` and μ in `mean`."""
     if in_single(value, mean):
         sine, cosine = _half_angle_in_single(value, mean)
         return sine * sine, sine * cosine
@@ -41,7 +41,7 @@ def half_products(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def in_single(value: Tensor, mean: Tensor) -> bool:
-    """Return whether to compute in float32 alone.
+    """Return whether to compute with the angles in float32 alone, instead of partly in float64.
 
     The result is true if both angles are float32 and no compiler or transform of torch.func prevents reading their
     values.
@@ -60,7 +60,8 @@ def _half_angle_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
 def parts_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return sin(d/2), cos(d/2), sin(e/2) and cos(e/2), where d is φ-μ rounded to float32, and e the rounding error.
 
-    This takes fewer operations than `_reduce`, because float32's sine and cosine are also exact for large angles.
+    φ is `value`, and μ is `mean`. This takes fewer operations than `_reduce`, because float32's sine and cosine are
+    also exact for large angles.
     """
     high = value - mean
     with torch.no_grad():
@@ -76,7 +77,7 @@ def parts_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor
 
 
 def _rounding_error(value: Tensor, mean: Tensor, high: Tensor) -> Tensor:
-    """Return the rounding error of `high`, the rounded difference φ-μ, by Knuth's two-sum.
+    """Return the rounding error of `high`, the rounded difference of `value` and `mean`, by Knuth's two-sum.
 
     `high` plus this error is the exact difference.
     """
@@ -87,7 +88,7 @@ def _rounding_error(value: Tensor, mean: Tensor, high: Tensor) -> Tensor:
 def _reduce(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return sin(ρ/2), cos(ρ/2) and a mask: 1 where n is odd, 0 where n is even.
 
-    The integer n and the rest ρ are those of φ-μ = nπ + ρ with the smallest |ρ|.
+    The integer n and the rest ρ are those of φ-μ = nπ + ρ with the smallest |ρ|, for φ in `value` and μ in `mean`.
     """
     if value.dtype == torch.float32 and mean.dtype == torch.float32:
         high = value.double() - mean.double()

@@ -137,7 +137,7 @@ class Level(nn.Module):
     Args:
         length: number of features of a point.
         centroids: largest number of centroids of a cloud.
-        radius: unit of the scales' radii, in units of the normalised cloud.
+        radius: factor by which the scales' radii are multiplied, in units of the normalised cloud.
         scales: sizes of the balls, and their layers; the features of all scales are concatenated.
         width: factor by which the scales' widths are multiplied.
     """

@@ -16,7 +16,7 @@ from plugins.metric.pose_error.errors import FittedImage
 def draw_descents(samples: Mapping[str, FittedImage], title: str, *, synthetic: bool) -> Figure:
     """Return a figure with a row for each sample: images of start, target and end, a difference, and error curves.
 
-    The difference image shows the end minus the target. The curves show the errors against steps.
+    The difference image shows the absolute difference of end and target. The curves show the errors against steps.
     """
     figure = titled_figure((11.0, 3.2 * len(samples)), title, synthetic)
     axes = figure.subplots(len(samples), 5, squeeze=False, width_ratios=(1, 1, 1, 1, 2.2))

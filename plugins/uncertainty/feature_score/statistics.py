@@ -92,10 +92,11 @@ def merge_clusters(clusters: Clusters) -> Clusters:
 def ledoit_wolf_share(empirical: Float[Tensor, "feature feature"], fourth: float, count: int) -> float:
     """Return the shrinkage b²/d² of Ledoit & Wolf 2004 (eq. 14), between 0 and 1.
 
-    d² = |S - m I|² and b² = min(d², 1/N² Σ_n |x_n x_nᵀ - S|²), where Σ_n |x_n x_nᵀ - S|² = Σ_n |x_n|⁴ - N |S|².
+    d² = |S - m I|² and b² = min(d², 1/N² Σ_n |x_n x_nᵀ - S|²), where Σ_n |x_n x_nᵀ - S|² = Σ_n |x_n|⁴ - N |S|². m is
+    the mean of the diagonal of S, and |·| the Frobenius norm.
 
     Args:
-        empirical: S, of centred samples.
+        empirical: S, the covariance of the centred samples x_n.
         fourth: sum of |x_n|⁴ over the samples.
         count: N.
     """
@@ -113,8 +114,8 @@ def whiten(empirical: Float[Tensor, "feature feature"], share: float) -> Float[T
     and distances are Euclidean.
 
     Args:
-        empirical: S.
-        share: s.
+        empirical: empirical covariance S of D features.
+        share: shrinkage s.
     """
     values, vectors = torch.linalg.eigh(empirical)
     values = (1 - share) * values + share * values.mean()

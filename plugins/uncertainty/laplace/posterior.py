@@ -193,7 +193,7 @@ def most_likely_precision(eigenvalues: Float[Tensor, "weight"], square: float) -
     by bisection. λ is bounded by e^±LARGEST_EXPONENT.
 
     Args:
-        eigenvalues: eigenvalues h of H.
+        eigenvalues: eigenvalues h of the Fisher information H of the weights.
         square: |W*|², the sum of the squared weights.
     """
     low, high = -LARGEST_EXPONENT, LARGEST_EXPONENT
@@ -217,8 +217,8 @@ def draw_deviations(
     machine or from the samples in another order, therefore gives nearly the same deviations.
 
     Args:
-        eigen: H.
-        precision: λ, 0-dimensional.
+        eigen: Fisher information H of the weights.
+        precision: precision λ of the prior, 0-dimensional.
         noise: standard normal numbers.
         shape: shape (raw, feature) of the weights.
     """

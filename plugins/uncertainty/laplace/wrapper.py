@@ -193,7 +193,7 @@ class Laplace(Uncertainty, ReadsTraining):
         self.precision.copy_(best)
 
     def _determined(self) -> float:
-        """Return the number of weights that the data determine, Σ h/(h + λ) (MacKay 1992)."""
+        """Return the number of weights that the data determine, Σ h/(h + λ), with eigenvalues h of H (MacKay 1992)."""
         return (self.eigenvalues / (self.eigenvalues + self.precision)).sum().item()
 
     def _deviations(self) -> Float[Tensor, "sample raw feature"] | None:
