@@ -1,1 +1,1 @@
-"""Densities over black and white images, with the probability of each pixel to be white."""
+"""Densities over images whose numbers are 0 or 1, with the probability of each number to be 1."""

@@ -70,7 +70,7 @@ class HybridHead(DensityHead):
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
         """Return the component's loss for (target - location) / scale, plus Σ log scale, nats (change of variables).
 
-        Location and scale belong to the affine transform by which the head moves the density of its component.
+        Location and scale are those of the affine transform that maps the component's density to the head's density.
         """
         numbers, location, scale = self._read(raw)
         return self.component.loss(numbers, (target - location) / scale) + scale.log().sum(-1)

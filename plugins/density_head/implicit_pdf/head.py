@@ -104,7 +104,10 @@ class ImplicitPDFHead(DensityHead):
         return total - at_label - math.log(self.training_cells + 1) - volume.to(raw.dtype)
 
     def _encode(self, angles: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape numbers"]:
-        """Return sin and cos of 2ʲπ times each element of the rotation matrix, in the dtype of the weights."""
+        """Return sin and cos of 2ʲπ times each element of the rotation matrix, j = 0 … `frequencies` - 1.
+
+        `angles` are azimuth, elevation and tilt of the rotation. The result has the dtype of the weights.
+        """
         weight = self.of_rotation.weight
         matrix = viewpoint_rotation(angles.double()).flatten(-2).to(weight.device)
         octaves = 2.0 ** torch.arange(self.frequencies, dtype=torch.float64, device=weight.device)

@@ -69,10 +69,10 @@ def log_normaliser(parameter: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*ba
 def log_node_weights(falls: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor]:
     """Return the nodes s of the quadrature for the normaliser F, and the logarithms of their terms.
 
-    F is an integral over s > 0 that depends on the parameter of the density only through λ. It is the sum of the terms.
+    F is an integral over s > 0 that depends on the parameter of the density only through λ. The sum of the terms is F.
 
     Args:
-        falls: λ (see the module), ascending.
+        falls: λ₁ ≤ λ₂ ≤ λ₃, the coefficients in d² = Σ λᵢqᵢ² + δ² for the aligned quaternion q of a rotation.
 
     Returns:
         s, (node,), and the logarithm of the term of each node, (*batch, node).

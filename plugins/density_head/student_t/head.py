@@ -37,10 +37,10 @@ class StudentTHead(HeadOfReals):
 
     The tails of the density fall with a power. A target far from the location therefore has a loss of a few nats, where
     the loss of a Gaussian is hundreds of nats. With `degrees_of_freedom="calibrated"` the head trains as a Gaussian,
-    and `calibrate` then chooses, by their likelihood, the degrees of freedom and a factor by which all scales are
-    multiplied. If `Target` has the mean and the standard deviations of the training targets, raw parameters describe
-    the target minus this mean, in these standard deviations. The density is then in the target's own unit and in double
-    precision.
+    and `calibrate` then chooses, by their penalised likelihood, the degrees of freedom and a factor by which all scales
+    are multiplied. If `Target` has the mean and the standard deviations of the training targets, raw parameters
+    describe the target minus this mean, in these standard deviations. The density is then in the target's own unit and
+    in double precision.
 
     Args:
         degrees_of_freedom: "calibrated": `calibrate` chooses one value for each number of the target. "predicted": the

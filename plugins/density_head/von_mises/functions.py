@@ -235,7 +235,7 @@ class _OfConcentration(Function):
 
 
 class _OneMinusRatio(_OfConcentration):
-    """Autograd function of 1 - A(κ), whose derivative is -A'(κ)."""
+    """Autograd function of 1 - A(κ), with A(κ) = I1(κ)/I0(κ); its derivative is -A'(κ)."""
 
     @staticmethod
     def forward(concentration: Tensor) -> Tensor:
@@ -248,7 +248,7 @@ class _OneMinusRatio(_OfConcentration):
 
 
 class _Ratio(_OfConcentration):
-    """Autograd function of A(κ), whose derivative is A'(κ)."""
+    """Autograd function of A(κ) = I1(κ)/I0(κ); its derivative is A'(κ)."""
 
     @staticmethod
     def forward(concentration: Tensor) -> Tensor:

@@ -210,7 +210,7 @@ def _log_quotient(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Tensor
 
 
 class _Bregman(Function):
-    """Autograd function of ∫_{κ₁}^{κ₂} (κ₂-x) A'(x) dx.
+    """Autograd function of ∫_{κ₁}^{κ₂} (κ₂-x) A'(x) dx, with A(κ) = I1(κ)/I0(κ).
 
     This is the Bregman divergence of log I0: its height at κ₂ above its tangent at κ₁.
     """
@@ -238,7 +238,7 @@ class _Bregman(Function):
 
 
 class _RatioRise(Function):
-    """Autograd function of the difference A(κ₂) - A(κ₁)."""
+    """Autograd function of the difference A(κ₂) - A(κ₁), with A(κ) = I1(κ)/I0(κ)."""
 
     @staticmethod
     def forward(ctx: Any, first: Tensor, second: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ EQUAL = 1e-6
 It allows for the rounding of float32.
 """
 TIE = 1e-6
-"""Relative difference below which lengths count as equal, and absolute difference below which values of log L do."""
+"""Relative difference of lengths, and absolute difference of values of log L, below which they count as equal."""
 GENERIC = (1.3, 0.9, 0.5)
 """The constant vector a of the values L(F a) that are compared; its components differ, and none is 0.
 
@@ -76,12 +76,12 @@ def _frames_through_points(points: Float[Tensor, "points 3"]) -> Float[Tensor, "
 def _frames_about(
     points: Float[Tensor, "points 3"], axis: Float[Tensor, "3"], last: bool = False
 ) -> Float[Tensor, "frame 3 3"]:
-    """Return right-handed frames that contain `axis`: one frame for each candidate of the axis that follows it.
+    """Return right-handed frames that contain `axis`, one frame for each candidate of a second axis.
 
-    `axis` is the first column and the second column follows it; if `last` is true, `axis` is the last column and the
-    first column follows it. Candidates are the directions, perpendicular to `axis`, towards the points farthest from
-    the line along `axis`. If several points are equally far from this line, only those farthest from the origin along
-    the line, on either side, give candidates.
+    `axis` is the first column, and the candidate is the second column; if `last` is true, `axis` is the last column,
+    and the candidate is the first column. Candidates are the directions, perpendicular to `axis`, towards the points
+    farthest from the line along `axis`. If several points are equally far from this line, only those farthest from the
+    origin along the line, on either side, give candidates.
     """
     along = points @ axis
     across = points - along[:, None] * axis

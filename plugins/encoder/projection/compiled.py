@@ -24,21 +24,23 @@ compiled = compiler(kernel_cache("projection", [Path(__file__), Path(lanes.__fil
 @compiled
 @no_type_check
 def project(cloud, focal, middle, nearest, farthest, depth, index, image):
-    """Fill `depth`, and either `index` or `image`; the array that is not filled is None.
+    """Fill `depth`, and either `index` or `image`, for the points of one cloud that a camera sees.
 
     The visible points are those that `encoder.visible_points_in_torch` finds; pixels are computed in float64. Points
     with NaN are left out, because a NaN fails every comparison.
 
     Args:
-        cloud: see the module.
+        cloud: (points, columns): x, y, z in the camera's coordinates, metres; red, green, blue.
         focal: focal length, pixels.
         middle: (column, row) of the principal point, pixels, from the upper left corner of the image. These numbers are
             larger by 0.5 than those from the centre of the first pixel.
         nearest: smallest depth of a visible point, metres.
         farthest: depth from which on points are not visible, metres.
-        depth: see the module.
-        index: see the module; None if the image is filled.
-        image: see the module; None if the index is filled.
+        depth: (height, width), filled with the depth of the point that each pixel shows, metres; infinite without a
+            point.
+        index: (height, width), filled with the index of this point, or -1 without a point; None if `image` is filled.
+        image: (4, height, width), filled with the point's colour and scaled depth, or 1 without a point; None if
+            `index` is filled.
     """
     height, width = depth.shape
     depth[:] = np.inf
@@ -79,8 +81,8 @@ def halve(depth, index, coarse_depth, coarse_index):
     Each pixel shows the nearest of the points that the four pixels at its place show.
 
     Args:
-        depth: see the module.
-        index: see the module.
+        depth: (height, width), depth of the point that each pixel shows, metres; infinite if it shows no point.
+        index: (height, width), index of the point that each pixel shows; -1 if it shows no point.
         coarse_depth: (rows, columns), filled with the depths of the image of half the size, metres.
         coarse_index: (rows, columns), filled with the indices of the points that the image of half the size shows.
     """

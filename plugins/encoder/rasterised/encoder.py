@@ -151,10 +151,10 @@ class Rasterised(Encoder):
         return features
 
     def _scene(self, cloud: Float[Tensor, "points columns"], row: int) -> Scene:
-        """Return the scene that shows the mesh whose vertices are the points of a cloud.
+        """Return the scene that shows the mesh whose vertices are the points of a cloud; `row` is its row in the batch.
 
-        Colours have a fourth channel, which is 1 everywhere on the mesh, so that its render is the share of each pixel
-        that the mesh covers.
+        Vertex colours have a fourth channel, which is 1 everywhere on the mesh, so that the render of this channel is
+        the share of each pixel that the mesh covers.
         """
         vertices, colors = cloud[:, :3].float(), cloud[:, 3:6].float()
         if self.people is None:

@@ -76,9 +76,10 @@ def areas_without_each(
 
 
 def jackknife_error(values: Float[Tensor, "count"]) -> Float[Tensor, ""]:
-    """Return the standard error of a statistic from its values without each of n samples; NaN for fewer than 2.
+    """Return the standard error of a statistic by the jackknife; NaN for fewer than 2 samples.
 
-    It is sqrt((n - 1)/n Σ_j (θ_j - mean θ)²) (Efron & Tibshirani 1993, eq. 11.5).
+    `values` are the n values θ_j that the statistic has if sample j of n is left out. The standard error is sqrt((n -
+    1)/n Σ_j (θ_j - mean θ)²) (Efron & Tibshirani 1993, eq. 11.5).
     """
     count = len(values)
     if count < 2:

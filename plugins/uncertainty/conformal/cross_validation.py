@@ -111,7 +111,7 @@ class IntervalSet(Unchanged, ValueSet):
         return self.low > self.high
 
     def intervals(self) -> list[list[tuple[float, float]]]:
-        """Return for every item of the flattened batch the list of its intervals (low, high): one, or none if empty."""
+        """Return one list for each item of the flattened batch: its interval (low, high), or nothing if it is empty."""
         pairs = zip(self.low.flatten().tolist(), self.high.flatten().tolist(), strict=True)
         return [[pair] if pair[0] <= pair[1] else [] for pair in pairs]
 
