@@ -52,8 +52,8 @@ class BallisticHead(DensityHead, Fitted):
 
     Position, velocity and spin at the first frame are estimated from the frames by robust least squares. The equation
     is integrated to the requested times, through a bounce if there is one. `fit` identifies the constants of ball and
-    table, and the noise, that make whole training windows most likely. `calibrate` fits one factor for the standard
-    deviation of each number.
+    table that make whole training windows most likely, and measures the noise. `calibrate` fits one factor for the
+    standard deviation of each number.
 
     The density of the state is N(estimate, (JᵀJ)⁻¹) with the Jacobian J of the residuals. This density is propagated to
     the future: "linearised" gives a normal density. "sampled" gives a mixture with one component for each sampled
@@ -118,7 +118,10 @@ class BallisticHead(DensityHead, Fitted):
 
     @torch.no_grad()
     def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
-        """Fit the constants and the noise that make whole training windows most likely (identification.py)."""
+        """Fit the constants that make whole training windows most likely (`identify`), and measure the noise.
+
+        With `identify=False` in the config, only the noise is measured.
+        """
         chosen = torch.linspace(0, len(features) - 1, min(WINDOWS, len(features))).round().long()
         observations = observed_frames(
             features[chosen].unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step

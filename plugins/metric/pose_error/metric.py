@@ -24,7 +24,8 @@ class PoseError(Metric, HasFigure):
 
     Medians, 95th percentiles and worst cases are reported, because the descent of a fit either reaches the true pose or
     ends in another minimum. If the density stores its descent (as `fit_pose` does), the figure shows the images of
-    start, target and end for the best, the median and the worst sample, and the errors against steps and time.
+    start, target and end for the best, the median and the worst sample, their errors after each step, and the time of
+    their fits.
 
     Raises:
         ConfigError: the target does not begin with a rotation and a translation.

@@ -132,9 +132,9 @@ def build_chain(networks: Sequence[nn.Module], dropout: Sequence[float | None]) 
 def layers_of(network: nn.Module) -> list[nn.Module] | None:
     """Return the layers of a network in their order if `Chain` can compute them; None otherwise.
 
-    A network is accepted if it consists of linear layers with a bias, pointwise functions and dropout. These layers may
-    be in nested `Sequential`s, and in modules whose only child is a `Sequential` named `layers`, such as the encoder
-    `mlp`.
+    A network is accepted if it consists of linear layers with a bias, pointwise functions, dropout, and layers that
+    only flatten or return their input; the latter are left out of the result. These layers may be in nested
+    `Sequential`s, and in modules whose only child is a `Sequential` named `layers`, such as the encoder `mlp`.
     """
     if isinstance(network, nn.Sequential):
         parts = [layers_of(part) for part in network]
