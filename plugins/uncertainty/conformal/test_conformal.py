@@ -5,6 +5,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mapie.regression import ConformalizedQuantileRegressor
+from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.datasets import make_moons
 from torch import nn
 from torch.distributions import Categorical
@@ -267,9 +269,25 @@ def quantile_model():
     return Model([], head, (1,)).double()
 
 
+class Quantile(RegressorMixin, BaseEstimator):
+    """One quantile of a model, as an estimator of scikit-learn that is already fitted."""
+
+    is_fitted = True  # MAPIE asks for it
+
+    def __init__(self, model, level):
+        self.model, self.level = model, level
+
+    def fit(self, rows, values):
+        return self
+
+    def predict(self, rows):
+        with torch.no_grad():
+            return self.model(torch.from_numpy(rows)).quantiles[:, self.level].numpy()
+
+
 @pytest.mark.parametrize("miscoverage", [0.1, 0.3])
 def test_quantiles_are_conformalised_as_romano_et_al_state(miscoverage):
-    """Compare with eq. 5-8 of Romano, Patterson & Candès 2019, written out, for quantiles of the head `quantiles`."""
+    """Compare with MAPIE and eq. 5-8 of Romano, Patterson & Candès 2019, for quantiles of the head `quantiles`."""
     height, model = Target("real", ("height",)), quantile_model()
     inputs, target = spread_pairs(301, np.random.default_rng(0))
     wrapper = around(model, height, score="quantiles", miscoverage=miscoverage)
@@ -295,6 +313,14 @@ def test_quantiles_are_conformalised_as_romano_et_al_state(miscoverage):
     expected = np.stack([low - moved, high + moved], 1)
     np.testing.assert_allclose(np.array(sets.intervals())[:, 0], expected, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(sets.size(), expected[:, 1] - expected[:, 0], rtol=1e-9)
+    mapie = ConformalizedQuantileRegressor(
+        [Quantile(model, levels[0]), Quantile(model, levels[1]), Quantile(model, 9)],
+        confidence_level=1 - miscoverage,
+        prefit=True,
+    )
+    mapie.conformalize(rows.numpy(), values.numpy()[:, 0])
+    _, ends = mapie.predict_interval(new.numpy(), symmetric_correction=True)
+    np.testing.assert_allclose(ends[..., 0], expected, rtol=1e-9, atol=1e-9)
     inside = (value[:, 0].numpy() >= expected[:, 0]) & (value[:, 0].numpy() <= expected[:, 1])
     assert sets.contains(value).tolist() == inside.tolist() and not sets.empty().any()
     assert not sets.size_error().any()

@@ -1,10 +1,13 @@
-"""Tests of CV+ intervals against a brute-force form of their definition, and of their coverage."""
+"""Tests of CV+ intervals against MAPIE and a brute-force form of their definition, and of their coverage."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
+from mapie.regression import CrossConformalRegressor
+from sklearn.linear_model import LinearRegression
+from sklearn.model_selection import PredefinedSplit
 
 from framework.configuration.schema import build, resolve
 from framework.distributions.exported import exported
@@ -107,6 +110,23 @@ def test_intervals_equal_the_definition(parts, miscoverage):
         low = sorted(lows)[first - 1] if first >= 1 else -math.inf
         high = sorted(highs)[last - 1] if last <= count else math.inf
         np.testing.assert_allclose([found.low[item].item(), found.high[item].item()], [low, high], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "parts, count, miscoverage", [(5, 40, 0.1), (4, 41, 0.2), (39, 39, 0.1), (5, 40, 0.024)]
+)
+def test_intervals_equal_those_of_mapie(parts, count, miscoverage):
+    wrapper, inputs, target = trained(count, parts, miscoverage=miscoverage)
+    other = CrossConformalRegressor(
+        LinearRegression(fit_intercept=False),
+        confidence_level=1 - miscoverage,
+        cv=PredefinedSplit(wrapper.model.part.numpy()),
+    )
+    other.fit_conformalize(inputs.numpy(), target.numpy()[:, 0])
+    new = table(200, 99)[0]
+    _, ends = other.predict_interval(new.numpy(), allow_infinite_bounds=True)
+    found = value_set(wrapper(new))
+    np.testing.assert_allclose(np.stack([found.low, found.high], 1), ends[..., 0], rtol=1e-9)
 
 
 @pytest.mark.parametrize("parts, count", [(5, 50), (39, 39)], ids=["CV+", "jackknife+"])
