@@ -17,7 +17,7 @@ CHANNELS = frozenset({"color", "mask", "depth"})
 def ball(place: Tensor, size: tuple[int, int], channels: Collection[str] = CHANNELS) -> dict[str, Tensor]:
     """Return images of a ball whose position depends on `place`.
 
-    The ball moves by an eighth of the image's shorter side for each unit of `place`.
+    For each unit of `place`, the ball moves by an eighth of the image's width or height.
 
     Args:
         place: Location of a density, (batch, number). The first number moves the ball to the right, the last one

@@ -36,9 +36,11 @@ def simulate_windows(
 ) -> tuple[Float[Tensor, "flight 20 5"], Float[Tensor, "flight 35 3"], Float[Tensor, "flight 9"]]:
     """Return flights that begin near `START`: observed frames, future positions without noise, and initial states.
 
+    About a tenth of the frames do not show the ball; all their numbers are 0.
+
     Args:
         count: Number of flights.
-        outliers: If true, the observed position is wrong by 0.4 m in a tenth of the frames.
+        outliers: If true, the observed position is wrong by 0.4 m along each axis in about a tenth of the frames.
     """
     random = np.random.default_rng(0)
     states = torch.from_numpy(

@@ -422,7 +422,8 @@ def _loss_in_nats(subject: HeadSubject, worst: Worst) -> None:
     """Check that the loss is in nats: if it is factor · -log_prob + constant, the factor must be 1.
 
     The error is relative to log_prob. Draws from the head's own densities decide whether the loss has this form. If it
-    has, it must also agree with log_prob at values that are very unlikely.
+    has, it must also agree with log_prob at values that are very unlikely. The loss of an image may also be the mean
+    over the numbers of the image.
     """
     if subject.draws():
         worst.count(False, "log_prob draws random numbers, so the loss may be a bound on it")

@@ -96,8 +96,8 @@ def depth(renderer: Renderer, worst: Worst) -> None:
 def scene_batches(renderer: Renderer, worst: Worst) -> None:
     """Check that scenes of different sizes give the same images in a batch as one by one.
 
-    Check also that faces may have any integer type, that a scene is unchanged after it was drawn, and that the results
-    of two calls share no memory.
+    Check also that faces may be int32, that a scene is unchanged after it was drawn, and that the results of two calls
+    share no memory.
     """
     scenes = [sphere(), square(2.0), replace(sphere(), camera=camera((33, 40))), square(5.0)]
     channels = sorted(renderer.channels)

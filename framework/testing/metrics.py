@@ -413,7 +413,7 @@ def _perfect(build: Make, row: MetricRow, worst: Worst) -> None:
     """Check that densities at the targets give better numbers than densities at other locations.
 
     All columns of `better` are compared. For a metric that reads outliers, the densities of outliers are broader than
-    those of test samples in the first comparison, and equally broad in the second.
+    those of the test samples if these are at the targets, and equally broad if these are at other locations.
     """
     metric = build()
     predicted = predictions(row, SAMPLES, images=bool(metric.reads))

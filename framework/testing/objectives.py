@@ -35,7 +35,7 @@ DRAWS = 8
 class Network(nn.Module):
     """Small network with batch norm, which has state, and dropout, which draws random numbers.
 
-    Its outputs are the parameters of `simplest_density` for the given target.
+    It returns the `simplest_density` for the target, with the location or the logits that its last layer gives.
 
     Attributes:
         gain: Factor on the raw parameters, which can make them extreme.
@@ -455,7 +455,7 @@ def _number_types(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _extreme(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check that penalty and gradients are finite at raw parameters up to ±1e4, as of an overconfident network."""
+    """Check that penalty and gradients are finite if the raw parameters are multiplied by up to 1e4."""
     for kind in (torch.float32, torch.float64):
         for size in (1e2, 1e4):
             predictor = predictor_of(row).to(kind)

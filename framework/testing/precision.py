@@ -49,10 +49,11 @@ def reference(subject: HeadSubject, worst: Worst, dtype: torch.dtype) -> None:
 def precision(subject: HeadSubject, worst: Worst) -> None:
     """Compare log_prob in float32 with float64 for the same head and inputs; the error is in float32 epsilons.
 
-    The error is relative to max(1, |log p|) plus the change of log p from rounding the raw parameters and angles. So a
-    large error comes from cancellation inside the head. For a head with parameters of its own, the change from rounding
-    these parameters is added where the error is large. log p may jump, as at the border of a cell in which the density
-    is constant. Within a few float32 epsilons of such a border, the result may be the log-density on either side of it.
+    The error is relative to max(1, |log p|) plus the change of log p from rounding the raw parameters and the value. So
+    a large error comes from cancellation inside the head. For a head with parameters of its own, the change from
+    rounding these parameters is added where the error is large. log p may jump, as at the border of a cell in which the
+    density is constant. Within a few float32 epsilons of such a border, the result may be the log-density on either
+    side of it.
     """
     single = subject.make()
     double = copy.deepcopy(single).double()
@@ -101,8 +102,8 @@ def rounding_change(
 ) -> tuple[Tensor, Tensor]:
     """Return log_prob of a float64 head, and its first-order change per relative rounding error of the inputs.
 
-    The change is Σ|r ∂log p/∂r| + Σ max(|φ|, π)|∂log p/∂φ| over raw parameters r and angles φ. With `parameters`, the
-    sum over the head's own parameters is added.
+    The change is Σ|r ∂log p/∂r| + Σ max(|y|, m)|∂log p/∂y| over raw parameters r and numbers y of the value, where m is
+    π for angles and 0 for real numbers. With `parameters`, the sum over the head's own parameters is added.
     """
     arguments = {"raw": raw.clone().requires_grad_()}
     if value.is_floating_point():

@@ -275,7 +275,7 @@ def check_mode_candidates(density: Distribution, worst: Worst) -> None:
 def check_marginal_cdfs(density: Distribution, worst: Worst) -> None:
     """Check that `marginal_cdfs` gives, for each number, the share of its draws below a value.
 
-    The error is in standard errors.
+    The error is in units of STANDARD_ERRORS standard errors.
     """
     value = draws_and_mode(density)
     stated = protocol.marginal_cdfs(density, value)
@@ -294,7 +294,7 @@ def check_marginal_cdfs(density: Distribution, worst: Worst) -> None:
 def check_moments(density: Distribution, worst: Worst) -> None:
     """Compare mean and variance of densities over many real numbers with those of draws, number by number.
 
-    The error is in standard errors.
+    The error is in units of STANDARD_ERRORS standard errors.
     """
     draws = density.sample(torch.Size((MANY,))).double()
     middle = draws.mean(0)
@@ -320,9 +320,10 @@ def check_moments(density: Distribution, worst: Worst) -> None:
 
 
 def check_medians(density: Distribution, worst: Worst) -> None:
-    """Check that half of the draws lie on each side of the median of each number; the error is in standard errors.
+    """Check that half of the draws lie on each side of the median of each number.
 
-    For angles the two sides are the half turns before and after the median.
+    For angles the two sides are the half turns before and after the median. The error is in units of STANDARD_ERRORS
+    standard errors.
     """
     seed(SEED)
     chosen = protocol.median(density, MANY // 2)

@@ -383,8 +383,8 @@ def _calibration(make: Make, row: WrapperRow, worst: Worst) -> None:
 def _trains_itself(make: Make, row: WrapperRow, worst: Worst) -> None:
     """Check a wrapper that trains its models itself (`SelfTraining`): repeatable training, and held-out predictions.
 
-    The training must change every wrapped model and no global random state. The mean loss that it returns must be
-    finite, and held-out predictions must exist for every sample.
+    The training must change the parameters and no global random state. The mean loss that it returns must be finite,
+    and held-out predictions must exist for every sample that is tried.
     """
     features, target = inputs(60), values(row.target, (60,))
     losses, log_probs = [], []
