@@ -67,7 +67,7 @@ def resolve_wrappers(wrappers: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the checked configs of the uncertainty wrappers in `wrappers`, innermost first.
 
     Raises:
-        ConfigError: There is no wrapper, or one of them trains several models.
+        ConfigError: There is no wrapper, or one of them trains several models or collects weights during training.
     """
     if not wrappers:
         raise ConfigError(
@@ -102,8 +102,8 @@ def wrap_trained(
         inputs: Inputs of a few samples, for which the predictor inside each wrapper predicts once.
 
     Raises:
-        ConfigError: A wrapper needs more than one model, has weights of its own to train, or would drop the conformal
-            prediction sets of the predictor inside it; or the wrapper itself raises the error.
+        ConfigError: A wrapper needs more than one model, has weights of its own to train, or would be put around a
+            predictor with conformal prediction sets; or the wrapper itself raises the error.
     """
     front = predictor if isinstance(predictor, FrozenFrontEnd) else None
     inner = predictor if front is None else front.predictor

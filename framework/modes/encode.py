@@ -357,12 +357,13 @@ def encode(
 
     Args:
         collection: Samples to encode.
-        config: Resolved configs of the encoders; without an encoder, the inputs themselves are written.
+        config: Resolved configs of the data set and of the encoders; without an encoder, the inputs themselves are
+            written.
         part_numbers: Numbers of the parts of this job.
         batch_size: Number of samples that are encoded together.
 
     Raises:
-        ConfigError: An encoder is trained.
+        ConfigError: An encoder is trained, or uses random numbers.
         DataError: A file cannot be read, or holds several samples; the message names it. Earlier parts are kept.
     """
     source = collection.source

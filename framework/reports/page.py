@@ -64,7 +64,7 @@ def plain_table(heads: Sequence[str], rows: Iterable[Sequence[str]], caption: st
     Args:
         heads: headings of the columns.
         rows: cells of each row.
-        caption: text above the table; "" for none.
+        caption: text below the table; "" for none.
     """
     head = "".join(f"<th>{escape(text)}</th>" for text in heads)
     body = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>\n" for row in rows)

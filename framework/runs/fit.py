@@ -55,8 +55,8 @@ class Fitted(NamedTuple):
 
     Attributes:
         loss: Validation loss of the fitted weights, nats.
-        epoch: Epoch of these weights, from 0; None if no part of the predictor is trained by gradient: its head is
-            fitted in one step, or it has nothing to learn (a renderer, for example).
+        epoch: Epoch of these weights, from 0; None if Lightning does not train the predictor: its head is fitted in one
+            step, a wrapper trains its models itself, or it has nothing to learn (a renderer, for example).
         pruned: Whether a search has ended the training.
     """
 
@@ -147,7 +147,7 @@ def _train_itself(session: Session, run: Run, wrapper: SelfTraining) -> float:
 
 
 def _log_only_loss(run: Run, loss: float) -> None:
-    """Log the validation loss of a model that is fitted in one step."""
+    """Log the only validation loss of a model that Lightning does not train."""
     if run.resumed:
         run.tracker.drop_after(-1)  # a killed run may have logged its loss, which has step 0
     run.tracker.log_metrics({"validation/loss": loss}, 0, 0)

@@ -62,7 +62,7 @@ def git_commit(folder: Path) -> dict[str, str]:
 
     `commit` has 40 or 64 hexadecimal digits; `dirty` is "true" or "false". The result is empty if the folder is in no
     repository or in a repository without a commit. It is also empty if the repository belongs to another user and the
-    configuration of this user does not list it under `safe.directory`. `dirty` is absent if git is missing, takes too
+    current user's configuration does not list it under `safe.directory`. `dirty` is absent if git is missing, takes too
     long, or would have to run a filter program to compare the files. Submodules are not inspected.
     """
     try:

@@ -127,7 +127,8 @@ def stored_config(folder: Path) -> dict[str, Any] | None:
 def may_resume(config: Config) -> bool:
     """Return whether the run in `config.folder` continues.
 
-    It continues if it is unfinished, its settings are those of `config`, and the setting `resume` is not "never".
+    It continues if it is unfinished, its settings are those of `config` apart from the keys in `CHANGEABLE`, and the
+    setting `resume` is not "never".
     """
     earlier = read_run_info(config.folder)
     return (
@@ -230,6 +231,6 @@ def resume_arguments(run: "Run") -> str:
 
 
 def remove_resume_files(run: "Run") -> None:
-    """Delete the checkpoints that only a resumed run needs, after model.ckpt was written."""
+    """Delete the checkpoints that only a resumed run needs; a mode calls this when no training is left to resume."""
     for name in (*TRAINED, BEST):
         (run.checkpoints / name).unlink(missing_ok=True)

@@ -272,7 +272,7 @@ def _require_whole_training(predictor: Predictor, config: Config) -> None:
 
     Raises:
         ConfigError: Training may stop early, keeps the weights of another epoch than the last, or has no planned number
-            of epochs; or a wrapper trains its models itself.
+            of epochs; or the model is not trained by gradient, or a wrapper trains its models itself.
     """
     wrapper = next((part for part in predictor.modules() if isinstance(part, FollowsTraining)), None)
     if wrapper is None:
@@ -364,8 +364,8 @@ def method_of(config: Config, parts: Resolved) -> str:
     """Return the name of a model in tables.
 
     The name is that of the experiment, or of the density head if there is no experiment, followed by the uncertainty
-    wrappers. Wrappers that are part of the experiment are not listed, and neither is the one that the experiment is
-    named after.
+    wrappers. With an experiment, the wrappers are listed only if the command changes them. The wrapper after which the
+    experiment is named is never listed.
     """
     name = config.settings.experiment_name
     method = name.rpartition("/")[2] if name else str(parts["density_head"]["name"])
@@ -402,7 +402,7 @@ def rehearse(session: Session) -> None:
 
     The function checks a few targets, lets the untrained model predict two samples, updates every metric with these
     predictions, and calibrates a copy of the model. If the model cannot predict before it is fitted, the function only
-    checks that the true images exist.
+    checks the targets, and that the true images exist.
 
     Raises:
         UserError: The data, a metric or an uncertainty wrapper fails with these samples.

@@ -62,8 +62,8 @@ def read(path: Path) -> dict[str, Any]:
     """Return the contents of a checkpoint, with tensors on the CPU, after its bytes passed the checksum.
 
     Raises:
-        CheckpointError: The file is missing, empty, cut short or damaged, or contains anything but plain values. The
-            message names the newest undamaged checkpoint in the same folder, if there is one.
+        CheckpointError: The file contains anything but plain values; or it is missing, empty, cut short or damaged,
+            and the message then names the newest undamaged checkpoint in the same folder, if there is one.
     """
     if not path.is_file():
         raise CheckpointError(f"There is no checkpoint {path}. {_remedy(path)}")

@@ -116,7 +116,7 @@ class _Item:
         size: Size of the text, or of everything that the value contains.
         values: Number of values that a tuple contains, including nested values.
         name: Name of a global as "module name"; "" for any other value.
-        text: Text of a short string, or of the last string of a tuple.
+        text: Text of a short string, or of the short string that ends a tuple; "" for any other value.
         mark: Whether the item is a mark, which a pickle pushes before a list of values, and not a value.
     """
 
