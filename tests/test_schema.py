@@ -365,7 +365,7 @@ def a_function() -> None:
         (
             Annotated[Path, Field(strict=True)],
             Path("/x"),
-            r"encoder\.value = '/x': .*plain value that a checkpoint stores, which the annotation of Taking does not",
+            r"encoder\.value = '/x': .*stores this setting as a plain value .* which the annotation in Taking does",
         ),
         (Annotated[int, Field(gt=0)], 0, r"encoder\.value = 0: Input should be greater than 0"),
         (int, None, r"encoder\.value = None: Input should be a valid integer"),

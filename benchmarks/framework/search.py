@@ -187,7 +187,8 @@ def section(name: str, runs: Mapping[str, list[Trial]]) -> list[str]:
         beaten(fronts[run], others) == len(fronts[run]) for run in searches for others in grids.values()
     )
     against = [
-        f"{sum(beaten(fronts[grid], results[run]) for run in searches) / len(searches):.1f} of {len(fronts[grid])}"
+        f"{sum(beaten(fronts[grid], results[run]) for run in searches) / len(searches):.1f} of the "
+        f"{len(fronts[grid])}"
         for grid in grids
     ]
     spreads = [float(np.std(times, ddof=1) / np.mean(times)) for times in run_times(runs).values()]
@@ -196,8 +197,8 @@ def section(name: str, runs: Mapping[str, list[Trial]]) -> list[str]:
         "",
         "A grid dominates the front of a search if the points of the grid beat every point of this front. This "
         f"happened in {dominated} of {len(searches) * len(grids)} comparisons. In the other direction, a search "
-        "can beat points on the front of a grid. The mean number of beaten points, over the searches, is: "
-        + ", ".join(f"{count} for the {grid}" for count, grid in zip(against, grids, strict=True))
+        "can beat points on the front of a grid. Averaged over the searches, a search beat "
+        + ", and ".join(f"{count} on the front of the {grid}" for count, grid in zip(against, grids, strict=True))
         + ".",
         "",
         "The standard deviation of single measurements of the run time of the same network is "

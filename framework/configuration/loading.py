@@ -289,13 +289,13 @@ class FirstPrediction:
         self.active: dict[int, budget.Budget] = {}  # by thread
 
     def start(self, module: nn.Module, inputs: tuple[Any, ...]) -> None:
-        """Start the memory limit if the batch is larger than every batch before."""
+        """Limit the memory of this prediction if its batch is larger than every batch before."""
         if isinstance(inputs[0], Tensor) and len(inputs[0]) > self.bounded:
             active = budget.predicting(self.path, module.state_dict().values(), inputs[0])
             self.active[get_ident()] = active.__enter__()
 
     def stop(self, module: nn.Module, inputs: tuple[Any, ...], density: Any) -> None:
-        """End the memory limit, and note the size of the batch if the prediction succeeded."""
+        """End the limit of `start`, and note the size of the batch if the prediction succeeded."""
         active = self.active.pop(get_ident(), None)
         if active is not None:
             active.__exit__(None, None, None)

@@ -240,8 +240,9 @@ def _checked_plain_values(cls: type, values: Mapping[str, Any], path: str) -> di
         reread = _to_plain_values(cls, _validate(cls, plain_values, path), path)
     except ConfigError as error:
         raise ConfigError(
-            f"{error} This is the plain value that a checkpoint stores, which the annotation of {cls.__name__} does "
-            "not accept. Annotate the parameter with a type that also accepts plain values."
+            f"{error} A checkpoint stores this setting as a plain value (numbers, texts, lists and dictionaries of "
+            f"them), which the annotation in {cls.__name__} does not accept. Annotate the parameter with a type that "
+            "also accepts this value."
         ) from None
     for key, value in plain_values.items():
         # NaN does not equal itself, so its text is compared too

@@ -94,7 +94,12 @@ def centres(parameters: Float[Tensor, "batch p"]) -> Float[Tensor, "batch pool"]
 def spectrum(
     parameters: Float[Tensor, "batch p"], offsets: Float[Tensor, "offset"]
 ) -> Float[Tensor, "batch offset"]:
-    """Return Z at the offsets (ppm) for parameters of the preset "ten" or "fifteen" (`Parameters.of`)."""
+    """Return the Z-spectrum at the offsets, the share of the water signal that remains after saturation.
+
+    Args:
+        parameters: parameters of the preset "ten" or "fifteen" (`Parameters.of`).
+        offsets: frequency offsets of the saturation from water, ppm.
+    """
     amplitude, width = parameters[:, :COUNT, None], parameters[:, COUNT : 2 * COUNT, None]
     square = (width / 2).square()
     lines = amplitude * square / (square + (offsets - centres(parameters).unsqueeze(-1)).square())

@@ -112,7 +112,7 @@ class AverageWeights(WeightAveraging):
         return torch.lerp(average, current.to(average.dtype), weight)
 
     def should_update(self, step_idx: int | None = None, epoch_idx: int | None = None) -> bool:
-        """Return True after a step of the epoch `first_epoch` or a later one, whose weights enter the average."""
+        """Return whether the weights after this step enter the average: from epoch `first_epoch` on."""
         return step_idx is not None and self._epoch >= self.first_epoch
 
     def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:

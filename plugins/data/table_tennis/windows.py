@@ -60,8 +60,9 @@ class Window(NamedTuple):
 def prefix(flight: Flight, now: int, grid: Grid) -> Float[np.ndarray, "number"] | None:
     """Return a model's input at frame `now`; None if fewer than `grid.least` frames are present.
 
-    Each frame is assigned to the nearest multiple of `grid.step` before frame `now`. If two frames are assigned to the
-    same multiple, the nearer frame is used.
+    The grid consists of the times of frame `now` and 1, 2, 3, … steps of `grid.step` before it. Each frame is assigned
+    to the grid time that is nearest to its own time. If several frames are assigned to the same grid time, the nearest
+    of them is used.
     """
     since = flight.times[: now + 1] - flight.times[now]
     steps = np.rint(since / grid.step).astype(int)

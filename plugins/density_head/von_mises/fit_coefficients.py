@@ -128,9 +128,16 @@ def powers(series: list[Real]) -> list[Real]:
 
 
 def table(dtype: str, which: int) -> list[tuple[float, ...]]:
-    """Return the coefficients of function number `which` on equal pieces of v, (power, piece), in ascending order of v.
+    """Return the polynomials that approximate a function of `smooth` on equal pieces of 0 ≤ v ≤ 1, v = 2/(κ+2).
 
     All pieces have the largest degree that any of them needs.
+
+    Args:
+        dtype: number type of the coefficients, which decides how many pieces there are (PIECES).
+        which: index of the function in NAMES.
+
+    Returns:
+        The coefficients, (power, piece), the pieces in ascending order of v.
     """
     count = PIECES[dtype]
     edges = [mpmath.mpf(i) / count for i in range(count + 1)]
