@@ -31,17 +31,18 @@ from benchmarks.pages import machine, publish
 from framework.encoder import Encoder
 from plugins.encoder.point_sets import pooled
 from plugins.encoder.point_sets.deepsets import DeepSets
+from plugins.encoder.point_sets.point_sets import FIRST_1024_POINTS, Reading
 from plugins.encoder.point_sets.pointnet import PointNet
 
 HERE = Path(__file__).resolve()
 BATCH, POINTS, TRAINED, ROUNDS = 16, 2048, 60, 7
 NETWORKS: dict[str, Callable[[], Encoder]] = {
     "PointNet (vanilla), 1024 points": lambda: PointNet(
-        (POINTS, 3), variant="vanilla", points=1024, dropout=0.0
+        (POINTS, 3), variant="vanilla", reading=FIRST_1024_POINTS, dropout=0.0
     ),
-    "PointNet, 1024 points": lambda: PointNet((POINTS, 3), points=1024, dropout=0.0),
+    "PointNet, 1024 points": lambda: PointNet((POINTS, 3), reading=FIRST_1024_POINTS, dropout=0.0),
     "DeepSets, 2048 points": lambda: DeepSets((POINTS, 3), dropout=0.0),
-    "DeepSets (micro), 100 points": lambda: DeepSets((POINTS, 3), points=100, dropout=0.0),
+    "DeepSets (micro), 100 points": lambda: DeepSets((POINTS, 3), reading=Reading(points=100), dropout=0.0),
 }
 
 

@@ -7,11 +7,10 @@ from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor, nn
 
-from framework.geometry.clouds import Normalisation
 from plugins.encoder.point_sets.point_sets import (
+    ALL_POINTS,
     CloudNetwork,
     Reading,
-    count_columns,
     largest,
     repeat_for_points,
 )
@@ -34,13 +33,8 @@ class DeepSets(CloudNetwork):
         widths: number of outputs of each layer after the maximum; the last is the length of the features.
         activation: the function σ.
         dropout: probability of dropping a number before and after each layer that follows the maximum.
-        points: number of points at the beginning of a cloud that are read; None for all. With 100 the network is the
-            one that the thesis calls "micro".
-        normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`).
-        attributes: whether columns after x, y, z are read too.
-
-    Raises:
-        ConfigError: the input is not a cloud, or has no attributes to read.
+        reading: the part of the clouds that is read. With `points` = 100 the network is the one that the thesis calls
+            "micro".
     """
 
     bibtex = "zaheer2017deep"
@@ -53,14 +47,10 @@ class DeepSets(CloudNetwork):
         widths: Annotated[list[Width], Field(min_length=1)] = [256],  # noqa: B006
         activation: Literal["tanh", "elu"] = "tanh",
         dropout: Annotated[float, Field(ge=0, lt=1)] = 0.5,
-        points: Annotated[int, Field(gt=0)] | None = None,
-        normalise: Normalisation = "unit_ball",
-        attributes: bool = False,
+        reading: Reading = ALL_POINTS,
     ) -> None:
-        super().__init__()
-        columns = count_columns(input_shape, "encoder deepsets", attributes)
-        self.reading = Reading(columns, points, normalise)
-        lengths = [columns, *channels]
+        super().__init__(input_shape, "encoder deepsets", reading)
+        lengths = [self.columns, *channels]
         self.equivariant = nn.ModuleList(
             nn.Linear(before, after) for before, after in zip(lengths, channels, strict=False)
         )

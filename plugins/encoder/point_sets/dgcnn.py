@@ -9,10 +9,9 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
-from framework.geometry.clouds import Normalisation
 from plugins.encoder.point_sets.layers import layers
 from plugins.encoder.point_sets.neighbours import nearest_rows
-from plugins.encoder.point_sets.point_sets import CloudNetwork, Reading, count_columns, largest, mean
+from plugins.encoder.point_sets.point_sets import FIRST_1024_POINTS, CloudNetwork, Reading, largest, mean
 from plugins.encoder.point_sets.pooled import fold_norm
 
 Width = Annotated[int, Field(gt=0)]
@@ -40,17 +39,11 @@ class DGCNN(CloudNetwork):
         point_width: number of outputs of the layer before the maximum and the mean over the cloud.
         widths: number of outputs of each layer after the maximum and the mean; the last is the length of the features.
         dropout: probability of dropping an output of each of these last layers.
-        points: number of points at the beginning of a cloud that are read; None for all.
-        normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`).
-        attributes: whether columns after x, y, z are read too; neighbours are found by x, y, z alone.
-
-    Raises:
-        ConfigError: the input is not a cloud, or has no attributes to read.
+        reading: the part of the clouds that is read; the first layer finds neighbours by x, y, z alone.
     """
 
     bibtex = "wang2019dynamic"
 
-    # More than eight parameters: each keyword is a config key that a user sets alone.
     def __init__(
         self,
         input_shape: tuple[int, ...],
@@ -60,17 +53,13 @@ class DGCNN(CloudNetwork):
         point_width: Width = 1024,
         widths: Annotated[list[Width], Field(min_length=1)] = [512, 256],  # noqa: B006
         dropout: Annotated[float, Field(ge=0, lt=1)] = 0.5,
-        points: Annotated[int, Field(gt=0)] | None = 1024,
-        normalise: Normalisation = "unit_ball",
-        attributes: bool = False,
+        reading: Reading = FIRST_1024_POINTS,
     ) -> None:
-        super().__init__()
-        columns = count_columns(input_shape, "encoder dgcnn", attributes)
-        self.reading = Reading(columns, points, normalise)
+        super().__init__(input_shape, "encoder dgcnn", reading)
         self.neighbours = neighbours
         # without the activation, which `edge_convolution` applies after the maximum
         self.edges = nn.ModuleList(
-            layers(2 * before, [after])[:2] for before, after in pairwise([columns, *edge_widths])
+            layers(2 * before, [after])[:2] for before, after in pairwise([self.columns, *edge_widths])
         )
         self.each = layers(sum(edge_widths), [point_width], SLOPE)
         length = 2 * point_width

@@ -2,10 +2,12 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
+from pydantic import Field
 from torch import Tensor
 
 from framework.encoder import Encoder
@@ -41,18 +43,23 @@ def count_columns(input_shape: tuple[int, ...], by: str, attributes: bool) -> in
     return input_shape[1] if attributes else 3
 
 
-class Reading(NamedTuple):
-    """The part of the clouds that an encoder reads, and their normalisation.
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """Settings of a network on clouds: the part of the clouds that it reads, and their normalisation.
 
     Attributes:
-        columns: number of leading columns that are read.
-        most: number of points at the beginning of a cloud that are read; None for all.
+        points: number of points at the beginning of a cloud that are read; None for all.
         normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`).
+        attributes: whether columns after x, y, z are read too.
     """
 
-    columns: int
-    most: int | None
-    normalise: Normalisation
+    points: Annotated[int, Field(gt=0)] | None = None
+    normalise: Normalisation = "unit_ball"
+    attributes: bool = False
+
+
+ALL_POINTS = Reading()
+FIRST_1024_POINTS = Reading(points=1024)
 
 
 class CloudNetwork(Encoder):
@@ -61,13 +68,26 @@ class CloudNetwork(Encoder):
     In evaluation without a gradient, a batch is encoded in parts of few clouds, so that intermediate results stay in
     the processor's caches.
 
+    Args:
+        input_shape: (points, columns).
+        by: name of the encoder, for messages.
+        reading: which points and columns of a cloud are read, and how the points are normalised.
+
     Attributes:
-        reading: which columns and points of a cloud are read, and how the points are normalised.
+        reading: the argument `reading`.
+        columns: number of leading columns that are read.
         rows_per_point: approximate number of rows of numbers that the network computes for each point.
+
+    Raises:
+        ConfigError: the input is not a cloud, or has no attributes to read.
     """
 
-    reading: Reading
     rows_per_point: int = 1
+
+    def __init__(self, input_shape: tuple[int, ...], by: str, reading: Reading) -> None:
+        super().__init__()
+        self.reading = reading
+        self.columns = count_columns(input_shape, by, reading.attributes)
 
     @abstractmethod
     def encode(
@@ -82,9 +102,10 @@ class CloudNetwork(Encoder):
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
         """Return the features of the clouds."""
-        columns, most, normalise = self.reading
-        dtype = next(self.parameters()).dtype
-        values, counts = concatenate_points(inputs, normalise, columns=columns, most=most, dtype=dtype)
+        reading, dtype = self.reading, next(self.parameters()).dtype
+        values, counts = concatenate_points(
+            inputs, reading.normalise, columns=self.columns, most=reading.points, dtype=dtype
+        )
         # batch norm in training needs the whole batch at once, and a trace depends on no number of points
         if self.training or torch.is_grad_enabled() or torch.compiler.is_exporting():
             return self.encode(values, counts)

@@ -7,9 +7,8 @@ from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor, nn
 
-from framework.geometry.clouds import Normalisation
 from plugins.encoder.point_sets.layers import layers
-from plugins.encoder.point_sets.point_sets import CloudNetwork, Reading, count_columns
+from plugins.encoder.point_sets.point_sets import ALL_POINTS, CloudNetwork, Reading
 from plugins.encoder.point_sets.pooled import largest_after
 
 Width = Annotated[int, Field(gt=0)]
@@ -32,12 +31,7 @@ class PointNet(CloudNetwork):
             have all of these layers but the first two.
         widths: number of outputs of each layer after the maximum; the last is the length of the features.
         dropout: probability of dropping an output of the last layer.
-        points: number of points at the beginning of a cloud that are read; None for all.
-        normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`).
-        attributes: whether columns after x, y, z are read too; the first matrix does not change them.
-
-    Raises:
-        ConfigError: the input is not a cloud, or has no attributes to read.
+        reading: the part of the clouds that is read; the first matrix changes only x, y, z.
     """
 
     bibtex = "qi2017pointnet"
@@ -50,17 +44,13 @@ class PointNet(CloudNetwork):
         point_widths: Annotated[list[Width], Field(min_length=LOCAL + 1)] = [64, 64, 64, 128, 1024],  # noqa: B006 - never written
         widths: Annotated[list[Width], Field(min_length=1)] = [512, 256],  # noqa: B006
         dropout: Annotated[float, Field(ge=0, lt=1)] = 0.3,
-        points: Annotated[int, Field(gt=0)] | None = None,
-        normalise: Normalisation = "unit_ball",
-        attributes: bool = False,
+        reading: Reading = ALL_POINTS,
     ) -> None:
-        super().__init__()
-        columns = count_columns(input_shape, "encoder pointnet", attributes)
-        self.reading = Reading(columns, points, normalise)
+        super().__init__(input_shape, "encoder pointnet", reading)
         after = point_widths[LOCAL:]
         full = variant == "full"
         self.input_matrix = Matrix(3, after, widths) if full else None
-        self.local = layers(columns, point_widths[:LOCAL])
+        self.local = layers(self.columns, point_widths[:LOCAL])
         self.feature_matrix = Matrix(point_widths[LOCAL - 1], after, widths) if full else None
         self.deep = layers(point_widths[LOCAL - 1], after)
         self.whole = layers(after[-1], widths)

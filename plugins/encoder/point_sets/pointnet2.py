@@ -8,11 +8,17 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
-from framework.geometry.clouds import Normalisation, pad, require_normalised, sizes
+from framework.geometry.clouds import pad, require_normalised, sizes
 from framework.geometry.farthest import farthest
 from plugins.encoder.point_sets.balls import find_within
 from plugins.encoder.point_sets.layers import layers
-from plugins.encoder.point_sets.point_sets import CloudNetwork, Reading, count_columns, first_rows, largest
+from plugins.encoder.point_sets.point_sets import (
+    FIRST_1024_POINTS,
+    CloudNetwork,
+    Reading,
+    first_rows,
+    largest,
+)
 
 Count = Annotated[int, Field(gt=0)]
 
@@ -71,17 +77,11 @@ class PointNet2(CloudNetwork):
             change in proportion.
         width: factor by which the published widths of all layers are multiplied.
         dropout: probability of dropping an output of each of the two last layers.
-        points: number of points at the beginning of a cloud that are read; None for all.
-        normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`).
-        attributes: whether columns after x, y, z are read too.
-
-    Raises:
-        ConfigError: the input is not a cloud, or has no attributes to read.
+        reading: the part of the clouds that is read.
     """
 
     bibtex = "qi2017pointnetplusplus"
 
-    # More than eight parameters: each keyword is a config key that a user sets alone.
     def __init__(
         self,
         input_shape: tuple[int, ...],
@@ -91,16 +91,12 @@ class PointNet2(CloudNetwork):
         radius: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.2,
         width: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
         dropout: Annotated[float, Field(ge=0, lt=1)] = 0.5,
-        points: Count | None = 1024,
-        normalise: Normalisation = "unit_ball",
-        attributes: bool = False,
+        reading: Reading = FIRST_1024_POINTS,
     ) -> None:
-        super().__init__()
-        columns = count_columns(input_shape, "encoder pointnet2", attributes)
-        self.reading = Reading(columns, points, normalise)
+        super().__init__(input_shape, "encoder pointnet2", reading)
         self.radius = radius
         self.levels = nn.ModuleList()
-        length = columns - 3
+        length = self.columns - 3
         for count, published in zip(centroids, PUBLISHED[grouping], strict=True):
             self.levels.append(Level(length, count, radius, published, width))
             length = sum(scale_widths(scale.widths, width)[-1] for scale in published)

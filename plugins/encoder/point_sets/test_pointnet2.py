@@ -48,7 +48,7 @@ def read_points(encoder, cloud):
     points = cloud.double().numpy().copy()
     points[:, :3] -= points[:, :3].mean(0)
     points[:, :3] /= np.sqrt((points[:, :3] ** 2).sum(1)).max()
-    return points[: encoder.reading.most, : encoder.reading.columns]
+    return points[: encoder.reading.points, : encoder.columns]
 
 
 def readings(points):
