@@ -1,23 +1,22 @@
 """Input and output of a U-Net: reading images, restricting computation to the subject's box, computing colours."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float, Shaped
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
 from framework.encoder import Encoder
 from framework.errors import ConfigError
 from framework.storage.processor import fast_bfloat16
-from plugins.encoder.unets.layers import Layer, Step, convolve
+from plugins.encoder.unets.layers import Layer, Normalisation, Step, convolve
 
 Precision = Literal["auto", "float32", "bfloat16"]
-
-
 WHITE = 6.0
 """Factor in the colours sigmoid(WHITE (1 + raw)), where raw is the output of the last convolution.
 
@@ -66,6 +65,31 @@ Maps = Callable[[Tensor, Iterator[Step]], Tensor]
 The images are differences from the empty background, and their sides are multiples of the stride. The layers are an
 iterator over functions, one for each layer of the network; the function takes one after the other.
 """
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Settings that all U-Nets share.
+
+    Attributes:
+        normalisation: "batch", by the moments of the batch; "renorm", by the moments of the batch, corrected towards
+            the running moments; or "group", by the moments of each image's groups of channels. See `layers.Layer`.
+        colors: number of output channels that are colours, whose values are in [0, 1].
+        scales: number of further output channels: logarithms of the scales of a density of the colours.
+        crop: margin, pixels. Evaluation computes only the subject's bounding box and this margin around it; None: the
+            whole image.
+        precision: precision of evaluation; "auto" is bfloat16 on processors with fast bfloat16 matrix products, else
+            float32.
+        residual: whether the network's output is added to the input's first `colors` channels, which are colours of a
+            rasterised mesh. Before training the output is then the input. Colours may lie a little beyond [0, 1].
+    """
+
+    normalisation: Normalisation = "renorm"
+    colors: Annotated[int, Field(gt=0)] = 3
+    scales: Literal[0, 1, 3] = 0
+    crop: Annotated[int, Field(ge=0)] | None = 32
+    precision: Precision = "float32"
+    residual: bool = False
 
 
 @dataclass(frozen=True)
@@ -198,17 +222,54 @@ class Canvas:
 class CroppedUNet(Encoder):
     """Base class of the U-Nets, which compute only the subject's box in evaluation.
 
+    Args:
+        name: name of the encoder, for messages.
+        input_shape: (channels, height, width); the network also reads images of other heights and widths.
+        settings: normalisation, output channels, crop and precision.
+
     Attributes:
+        settings: the argument `settings`.
         layers: layers of the network, in the order in which `maps` uses them.
         head: last convolution.
         canvas: settings of the input and the output.
         report: areas of the images of the last batch that evaluation computed; None after training, and without crop.
+
+    Raises:
+        ConfigError: the input is not an image, or has too few channels, or `crop` with `normalisation="group"`.
     """
 
     layers: nn.ModuleList
     head: nn.Conv2d
     canvas: Canvas
     report: CropReport | None = None
+
+    def __init__(self, name: str, input_shape: tuple[int, ...], settings: Settings) -> None:
+        super().__init__()
+        require_images(name, input_shape, settings)
+        self.settings = settings
+        self.output_shape = (settings.colors + settings.scales, *input_shape[1:])
+
+    def build_layers(
+        self, shapes: Sequence[tuple[int, int, int]], size: int, stride: int, shuffle: int = 1
+    ) -> None:
+        """Build `layers`, `head` and `canvas`; the constructor of a network calls this method.
+
+        Args:
+            shapes: channels, outputs and side of the kernel of each layer.
+            size: side of the kernel of the last convolution, pixels.
+            stride: number of pixels of which the sides of the images are multiples (`Canvas`).
+            shuffle: side, pixels, of the squares whose values the last convolution returns as channels.
+        """
+        settings = self.settings
+        self.layers = nn.ModuleList(Layer(*shape, settings.normalisation) for shape in shapes)
+        _, channels, _ = shapes[-1]
+        self.head = build_head(
+            channels, size, settings.colors, settings.scales, shuffle**2, residual=settings.residual
+        )
+        self.canvas = Canvas(
+            settings.colors, stride, settings.crop, settings.precision, shuffle, residual=settings.residual
+        )
+        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     @abstractmethod
     def maps(self, images: Tensor, layers: Iterator[Step]) -> Tensor:
@@ -270,17 +331,13 @@ def build_head(
     return convolution
 
 
-def require_images(
-    name: str, input_shape: tuple[int, ...], normalisation: str, crop: int | None, least: int = 1
-) -> None:
+def require_images(name: str, input_shape: tuple[int, ...], settings: Settings) -> None:
     """Require images with enough channels, and compatible settings of crop and normalisation.
 
     Args:
         name: name of the encoder, for messages.
         input_shape: (channels, height, width).
-        normalisation: normalisation of the layers: "batch", "renorm" or "group".
-        crop: margin around the subject's box that evaluation computes, pixels; None: the whole image.
-        least: smallest allowed number of channels of the input.
+        settings: settings of the network.
 
     Raises:
         ConfigError: the input is not an image, or has too few channels, or crop and normalisation exclude each other.
@@ -291,13 +348,14 @@ def require_images(
             f"shape {input_shape}. Choose another encoder for this input, or put one before {name} that returns an "
             "image."
         )
-    if input_shape[0] < least:
+    if settings.residual and input_shape[0] < settings.colors:
         raise ConfigError(
-            f"encoder.{name}.residual=true adds to {least} colours of the input, but the input has {input_shape[0]} "
-            f"channels. Set residual=false, or put an encoder before {name} that returns colours."
+            f"encoder.{name}.residual=true adds to {settings.colors} colours of the input, but the input has "
+            f"{input_shape[0]} channels. Set residual=false, or put an encoder before {name} that returns colours."
         )
-    if normalisation == "group" and crop is not None:
+    if settings.normalisation == "group" and settings.crop is not None:
         raise ConfigError(
-            f"encoder.{name}.normalisation=group normalises by the whole image, but crop={crop} computes only a part "
-            "of the image, so that the colours would depend on this part. Set crop=null, or normalisation=renorm."
+            f"encoder.{name}.normalisation=group normalises by the whole image, but crop={settings.crop} computes only "
+            "a part of the image, so that the colours would depend on this part. Set crop=null, or "
+            "normalisation=renorm."
         )

@@ -2,18 +2,19 @@
 
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from pydantic import Field
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
-from plugins.encoder.unets.canvas import Canvas, CroppedUNet, Precision, build_head, require_images
-from plugins.encoder.unets.layers import Layer, Normalisation, Step
+from plugins.encoder.unets.canvas import CroppedUNet, Settings
+from plugins.encoder.unets.layers import Step
 
 Channels = Annotated[int, Field(gt=0)]
+DEFAULT_SETTINGS = Settings(crop=24)
 
 
 class Slim(CroppedUNet):
@@ -30,52 +31,28 @@ class Slim(CroppedUNet):
         input_shape: (channels, height, width); the network also reads images of other heights and widths.
         widths: channels of each level. Processors compute 16 channels at once, so that 24 cost as much as 32.
         unshuffle: side of a square, pixels.
-        normalisation: "batch", "renorm" or "group" (`layers.Layer`).
-        colors: number of output channels that are colours, whose values are in [0, 1].
-        scales: number of further output channels: logarithms of the scales of a density of the colours.
-        crop: margin, pixels. Evaluation computes only the subject's bounding box and this margin around it; None: the
-            whole image.
-        precision: precision of evaluation; "auto" is bfloat16 on processors with fast bfloat16 matrix products, else
-            float32.
-        residual: whether the network's output is added to the input's first `colors` channels.
-
-    Raises:
-        ConfigError: the input is not an image, or `crop` with `normalisation="group"`.
+        settings: normalisation, output channels, crop and precision.
     """
 
     bibtex = "shi2016realtime"
 
-    # More than eight parameters: each keyword is a config key that a user sets alone.
     def __init__(
         self,
         input_shape: tuple[int, ...],
         *,
         widths: Annotated[list[Channels], Field(min_length=1, max_length=8)] = [32, 48, 64, 96],  # noqa: B006 - never written
         unshuffle: Annotated[int, Field(ge=1, le=8)] = 2,
-        normalisation: Normalisation = "renorm",
-        colors: Annotated[int, Field(gt=0)] = 3,
-        scales: Literal[0, 1, 3] = 0,
-        crop: Annotated[int, Field(ge=0)] | None = 24,
-        precision: Precision = "float32",
-        residual: bool = False,
+        settings: Settings = DEFAULT_SETTINGS,
     ) -> None:
-        super().__init__()
-        require_images("slim", input_shape, normalisation, crop, colors if residual else 1)
+        super().__init__("slim", input_shape, settings)
         self.unshuffle = unshuffle
         self.levels = len(widths)
-        first, pixels = widths[0], unshuffle**2
-        shapes = [(input_shape[0] * pixels, first, 3)]
+        shapes = [(input_shape[0] * unshuffle**2, widths[0], 3)]
         for upper, lower in pairwise(widths):
             shapes += [(upper, lower, 2), (lower, lower, 3)]
         shapes += [(lower, upper, 3) for upper, lower in reversed(list(pairwise(widths)))]
-        shapes += [(first, first, 3)]
-        self.layers = nn.ModuleList(Layer(*shape, normalisation) for shape in shapes)
-        self.head = build_head(first, 3, colors, scales, pixels, residual=residual)
-        self.canvas = Canvas(
-            colors, unshuffle * 2 ** (self.levels - 1), crop, precision, unshuffle, residual=residual
-        )
-        self.output_shape = (colors + scales, *input_shape[1:])
-        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+        shapes += [(widths[0], widths[0], 3)]
+        self.build_layers(shapes, 3, unshuffle * 2 ** (self.levels - 1), unshuffle)
 
     def maps(self, images: Tensor, layers: Iterator[Step]) -> Tensor:
         """Return the feature maps that the last convolution reads.
