@@ -13,6 +13,9 @@ from framework.storage.light_torchmetrics import torchmetrics
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+Directions = dict[str, Literal["higher", "lower"]]
+"""Directions in which numbers are better, by the names of the numbers."""
+
 
 class Metric(torchmetrics.Metric, ABC):
     """A torchmetrics.Metric that reads predictions.
@@ -47,7 +50,7 @@ class Metric(torchmetrics.Metric, ABC):
     A key `<name>_sem` is printed behind `<name>` as ± and has no heading of its own.
     """
 
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {}
+    better: ClassVar[Directions] = {}
     """Better direction, "higher" or "lower", of those columns that have one, by their keys in `columns`."""
 
     @abstractmethod

@@ -1,10 +1,10 @@
 """Example of a metric: the mean of the largest error of each sample."""
 
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 from torch import Tensor
 
-from framework.metric import Mean
+from framework.metric import Directions, Mean
 from framework.prediction import Prediction
 from framework.target import Target
 
@@ -20,7 +20,7 @@ class Example(Mean):
 
     bibtex = ""
     columns: ClassVar[dict[str, str]] = {"example": "largest error"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"example": "lower"}
+    better: ClassVar[Directions] = {"example": "lower"}
 
     def __init__(self, target: Target) -> None:
         super().__init__()

@@ -1,12 +1,12 @@
 """Accuracy and its standard error, computed from two counts."""
 
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from framework.distributions.class_probabilities import require_labels
-from framework.metric import Metric
+from framework.metric import Directions, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 
@@ -24,7 +24,7 @@ class Accuracy(Metric):
 
     bibtex = "hastie2009elements"
     columns: ClassVar[dict[str, str]] = {"accuracy": "accuracy"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"accuracy": "higher"}
+    better: ClassVar[Directions] = {"accuracy": "higher"}
     count: Tensor
     right: Tensor
 

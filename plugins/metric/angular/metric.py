@@ -1,7 +1,7 @@
 """Mean and median absolute angular deviation of the point prediction."""
 
 import math
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -9,7 +9,7 @@ from torch import Tensor
 from torchmetrics.utilities.data import dim_zero_cat
 
 from framework.distributions.circular import angular_distance
-from framework.metric import Mean, Metric
+from framework.metric import Directions, Mean, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 
@@ -32,7 +32,7 @@ class MeanAngularDeviation(Mean):
 
     bibtex = BEYER
     columns: ClassVar[dict[str, str]] = {"maad_deg": "MAAD °"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"maad_deg": "lower"}
+    better: ClassVar[Directions] = {"maad_deg": "lower"}
 
     def __init__(self, target: Target) -> None:
         super().__init__()
@@ -70,7 +70,7 @@ class MedianAngularDeviation(Metric):
 
     bibtex = BEYER
     columns: ClassVar[dict[str, str]] = {"median_deviation_deg": "median °"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"median_deviation_deg": "lower"}
+    better: ClassVar[Directions] = {"median_deviation_deg": "lower"}
     deviations: list[Tensor] | Tensor
 
     def __init__(self, target: Target) -> None:

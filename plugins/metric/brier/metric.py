@@ -1,13 +1,13 @@
 """Brier score (squared error of class probabilities) and its standard error."""
 
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float64, Int
 from torch import Tensor
 
 from framework.distributions.class_probabilities import require_labels
-from framework.metric import Mean
+from framework.metric import Directions, Mean
 from framework.prediction import Prediction
 from framework.target import Target
 
@@ -27,7 +27,7 @@ class Brier(Mean):
 
     bibtex = "brier1950verification"
     columns: ClassVar[dict[str, str]] = {"brier": "Brier"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"brier": "lower"}
+    better: ClassVar[Directions] = {"brier": "lower"}
 
     def __init__(self, target: Target) -> None:
         super().__init__()

@@ -11,7 +11,7 @@ from torchmetrics.utilities.data import dim_zero_cat
 
 from framework.distributions.class_probabilities import require_labels
 from framework.errors import ConfigError
-from framework.metric import HasFigure, Metric
+from framework.metric import Directions, HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 
@@ -56,7 +56,7 @@ class CalibrationError(Metric, HasFigure):
 
     bibtex = "guo2017calibration, kumar2019verified"
     columns: ClassVar[dict[str, str]] = {"ece": "ECE", "ece_equal_mass": "ECE (equal mass)"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"ece": "lower", "ece_equal_mass": "lower"}
+    better: ClassVar[Directions] = {"ece": "lower", "ece_equal_mass": "lower"}
     figure_name = "reliability"
     samples: list[Tensor] | Tensor
 

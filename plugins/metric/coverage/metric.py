@@ -1,14 +1,14 @@
 """Calibration of densities of any kind by their highest-density regions."""
 
 import math
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
 from framework.distributions.checks import refuse_nan
-from framework.metric import HasFigure, Metric
+from framework.metric import Directions, HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.coverage.functional import border, coverage_probability
@@ -54,7 +54,7 @@ class Coverage(Metric, HasFigure):
         "coverage_90": "cover 90 %",
         "coverage_error": "coverage error",
     }
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"coverage_error": "lower"}
+    better: ClassVar[Directions] = {"coverage_error": "lower"}
     figure_name: ClassVar[str] = "coverage"
     count: Tensor
     inside: Tensor

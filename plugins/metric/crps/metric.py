@@ -1,14 +1,14 @@
 """Mean continuous ranked probability score, over all numbers of the target and for each number."""
 
 import math
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
 from framework.distributions.checks import refuse_nan
-from framework.metric import Mean
+from framework.metric import Directions, Mean
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.crps.score import REPLICATES, crps
@@ -35,7 +35,7 @@ class CRPS(Mean):
 
     bibtex = "grimit2006continuous"
     columns: ClassVar[dict[str, str]] = {"crps": "CRPS"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"crps": "lower"}
+    better: ClassVar[Directions] = {"crps": "lower"}
     variance: Tensor
 
     def __init__(

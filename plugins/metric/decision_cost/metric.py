@@ -2,7 +2,7 @@
 
 import math
 from itertools import pairwise
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 import torch
 from pydantic import Field
@@ -11,7 +11,7 @@ from torch import Tensor
 from framework.configuration.paths import Words
 from framework.distributions.class_probabilities import require_labels
 from framework.errors import ConfigError, did_you_mean
-from framework.metric import Metric
+from framework.metric import Directions, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.decision_cost.functional import (
@@ -59,7 +59,7 @@ class DecisionCost(Metric):
         "decision_cost_fixed": "cost, fixed",
         "decision_cost_oracle": "cost, oracle",
     }
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"decision_cost": "lower"}
+    better: ClassVar[Directions] = {"decision_cost": "lower"}
     costs: Tensor
     edges: Tensor
     count: Tensor

@@ -1,13 +1,13 @@
 """Errors of the point prediction of real-valued targets, in the unit of the target."""
 
 from abc import abstractmethod
-from typing import ClassVar, Literal, final
+from typing import ClassVar, final
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from framework.metric import Mean
+from framework.metric import Directions, Mean
 from framework.prediction import Prediction
 from framework.target import Target
 
@@ -38,14 +38,14 @@ class Errors(Mean):
     def power(self, error: Float[Tensor, "batch number"]) -> Float[Tensor, "batch number"]:
         """Return the function of the error whose mean is taken, such as its square."""
 
-    @abstractmethod
     def result(self, mean: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the reported number and its standard error.
+        """Return the reported number and its standard error: by default the mean of `power` itself.
 
         Args:
             mean: mean of `power` over samples.
             error: standard error of this mean.
         """
+        return mean, error
 
     def update(self, prediction: Prediction) -> None:
         # convert to float64 first, so that the difference is not rounded to float32
@@ -68,13 +68,10 @@ class MeanAbsoluteError(Errors):
 
     key = "mae"
     columns: ClassVar[dict[str, str]] = {"mae": "MAE"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"mae": "lower"}
+    better: ClassVar[Directions] = {"mae": "lower"}
 
     def power(self, error: Float[Tensor, "batch number"]) -> Float[Tensor, "batch number"]:
         return error.abs()
-
-    def result(self, mean: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:
-        return mean, error
 
 
 @final
@@ -87,7 +84,7 @@ class RootMeanSquareError(Errors):
 
     key = "rmse"
     columns: ClassVar[dict[str, str]] = {"rmse": "RMSE"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"rmse": "lower"}
+    better: ClassVar[Directions] = {"rmse": "lower"}
 
     def power(self, error: Float[Tensor, "batch number"]) -> Float[Tensor, "batch number"]:
         return error.square()

@@ -1,6 +1,6 @@
 """Distance of predicted flights from the true ones, frame by frame, and accuracy of predicted landing places."""
 
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.flights.frames import PARTS, future_frames
-from framework.metric import HasFigure, Metric
+from framework.metric import Directions, HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.flight_error.landing import ShownFlight, from_start, landings, last_seen
@@ -48,9 +48,7 @@ class FlightError(Metric, HasFigure):
         "landing_crps_cm": "landing CRPS cm",
         "landing_cover_90": "landing in 90 %",
     }
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(
-        ("error_cm", "error_far_cm", "landing_crps_cm"), "lower"
-    )
+    better: ClassVar[Directions] = dict.fromkeys(("error_cm", "error_far_cm", "landing_crps_cm"), "lower")
     figure_name: ClassVar[str] = "flights"
     count: Tensor
     distance: Tensor

@@ -1,13 +1,14 @@
 """Learned perceptual image patch similarity of predicted images."""
 
 import math
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 from jaxtyping import Float
 from torch import Tensor
 
 from framework.configuration.paths import FilePath
 from framework.errors import DataError
+from framework.metric import Directions
 from plugins.metric.images.metric import encode_colors
 from plugins.metric.images.per_image import PerImage
 from plugins.metric.images.perceptual import LEAST_SIDE, Backbone, Distance
@@ -36,7 +37,7 @@ class LPIPS(PerImage):
     bibtex = "zhang2018unreasonable"
     reads: ClassVar[frozenset[str]] = frozenset({"color"})
     columns: ClassVar[dict[str, str]] = {"lpips": "LPIPS", "lpips_masked": "LPIPS in mask"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "lower")
+    better: ClassVar[Directions] = dict.fromkeys(columns, "lower")
     figure_name: ClassVar[str] = "lpips"
 
     def __init__(

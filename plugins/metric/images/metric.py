@@ -8,6 +8,7 @@ from torch import Tensor
 
 from framework.errors import DataError
 from framework.geometry.srgb import srgb_from_linear
+from framework.metric import Directions
 from plugins.metric.images import functional
 from plugins.metric.images.per_image import PerImage
 
@@ -52,7 +53,7 @@ class PSNR(PerImage):
     bibtex = "huynhthu2008scope"
     reads: ClassVar[frozenset[str]] = frozenset({"color"})
     columns: ClassVar[dict[str, str]] = {"psnr_db": "PSNR dB", "psnr_masked_db": "PSNR in mask, dB"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "higher")
+    better: ClassVar[Directions] = dict.fromkeys(columns, "higher")
     figure_name: ClassVar[str] = "psnr"
 
     def __init__(
@@ -92,7 +93,7 @@ class SSIM(PerImage):
     bibtex = "wang2004image"
     reads: ClassVar[frozenset[str]] = frozenset({"color"})
     columns: ClassVar[dict[str, str]] = {"ssim": "SSIM", "ssim_masked": "SSIM in mask"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "higher")
+    better: ClassVar[Directions] = dict.fromkeys(columns, "higher")
     figure_name: ClassVar[str] = "ssim"
 
     def __init__(self, *, encoding: Encoding = "srgb", masked: bool = True) -> None:
@@ -122,7 +123,7 @@ class MSSSIM(PerImage):
     bibtex = "wang2003multiscale"
     reads: ClassVar[frozenset[str]] = frozenset({"color"})
     columns: ClassVar[dict[str, str]] = {"ms_ssim": "MS-SSIM"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "higher")
+    better: ClassVar[Directions] = dict.fromkeys(columns, "higher")
     figure_name: ClassVar[str] = "ms_ssim"
 
     def __init__(self, *, encoding: Encoding = "srgb", scales: Annotated[int, Field(ge=1, le=5)] = 5) -> None:
@@ -148,7 +149,7 @@ class SilhouetteIoU(PerImage):
     bibtex = "everingham2010pascal"
     reads: ClassVar[frozenset[str]] = frozenset({"mask"})
     columns: ClassVar[dict[str, str]] = {"silhouette_iou": "silhouette IoU"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "higher")
+    better: ClassVar[Directions] = dict.fromkeys(columns, "higher")
     figure_name: ClassVar[str] = "silhouette_iou"
 
     def __init__(self) -> None:
@@ -170,7 +171,7 @@ class DepthError(PerImage):
     bibtex = "eigen2014depth"
     reads: ClassVar[frozenset[str]] = frozenset({"depth"})
     columns: ClassVar[dict[str, str]] = {"depth_error_m": "depth error m", "depth_unmatched": "unmatched"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "lower")
+    better: ClassVar[Directions] = dict.fromkeys(columns, "lower")
     figure_name: ClassVar[str] = "depth_error"
 
     def __init__(self) -> None:

@@ -1,7 +1,7 @@
 """Mean log-likelihood or its negative, with the standard error, from a running mean and sum of squared deviations."""
 
 import logging
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from framework.distributions.checks import refuse_nan
 from framework.distributions.protocol import Estimate
-from framework.metric import Metric
+from framework.metric import Directions, Metric
 from framework.prediction import Prediction
 
 UNLIKELY = 20.0
@@ -54,7 +54,7 @@ class LogLikelihood(Moments):
 
     bibtex = "gneiting2007strictly"
     columns: ClassVar[dict[str, str]] = {"log_likelihood": "log-likelihood (nats)"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"log_likelihood": "higher"}
+    better: ClassVar[Directions] = {"log_likelihood": "higher"}
 
     def update(self, prediction: Prediction) -> None:
         self.add_samples(prediction.log_prob, prediction.estimate)
@@ -76,7 +76,7 @@ class NegativeLogLikelihood(Moments):
 
     bibtex = "good1952rational"
     columns: ClassVar[dict[str, str]] = {"nll": "NLL (nats)"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"nll": "lower"}
+    better: ClassVar[Directions] = {"nll": "lower"}
 
     def update(self, prediction: Prediction) -> None:
         self.add_samples(

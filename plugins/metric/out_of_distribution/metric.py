@@ -13,7 +13,7 @@ from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.model_mixtures import expected_entropy
 from framework.distributions.unchanged import outlier_score
 from framework.errors import ConfigError
-from framework.metric import Metric
+from framework.metric import Directions, Metric
 from framework.prediction import Prediction, Split
 
 
@@ -52,12 +52,7 @@ class OutOfDistribution(Metric):
         "aupr": "AUPR",
         "fpr95": "FPR95",
     }
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {
-        "ood_entropy": "higher",
-        "auroc": "higher",
-        "aupr": "higher",
-        "fpr95": "lower",
-    }
+    better: ClassVar[Directions] = {**dict.fromkeys(columns, "higher"), "fpr95": "lower"}
     test: list[Tensor] | Tensor
     outliers: list[Tensor] | Tensor
 

@@ -1,6 +1,6 @@
 """Calibration of densities of real numbers and angles by the probability integral transform."""
 
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import torch
 from pydantic import Field
@@ -8,7 +8,7 @@ from torch import Tensor
 from torchmetrics.utilities.data import dim_zero_cat
 
 from framework.distributions.checks import refuse_nan
-from framework.metric import HasFigure, Metric
+from framework.metric import Directions, HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.pit.functional import cramer_von_mises, kolmogorov_smirnov, transform
@@ -41,7 +41,7 @@ class PIT(Metric, HasFigure):
 
     bibtex = "diebold1998evaluating"
     columns: ClassVar[dict[str, str]] = {"pit_ks": "PIT KS"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"pit_ks": "lower"}
+    better: ClassVar[Directions] = {"pit_ks": "lower"}
     figure_name: ClassVar[str] = "pit"
     values: list[Tensor] | Tensor
 

@@ -1,7 +1,7 @@
 """Calibration of densities over images, value by value, and correlation of predicted scales with errors."""
 
 import math
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -12,7 +12,7 @@ from torchmetrics.utilities import dim_zero_cat
 from framework.distributions.checks import refuse_nan
 from framework.errors import DataError
 from framework.figures.chosen_images import choose_images
-from framework.metric import HasFigure, Metric
+from framework.metric import Directions, HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.pixel_uncertainty.functional import coverage, rank_correlation, transform
@@ -60,10 +60,7 @@ class PixelUncertainty(Metric, HasFigure):
         "spearman": "error by scale",
         "spearman_masked": "error by scale, in mask",
     }
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {
-        "spearman": "higher",
-        "spearman_masked": "higher",
-    }
+    better: ClassVar[Directions] = {"spearman": "higher", "spearman_masked": "higher"}
     figure_name: ClassVar[str] = "pixel_uncertainty"
     numbers: list[Tensor]
     facts: list[Tensor]

@@ -1,6 +1,6 @@
 """Metric `pose_error`: errors of predicted bodies' rotation and translation, and figures of the descents."""
 
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -10,7 +10,7 @@ from torchmetrics.utilities import dim_zero_cat
 from framework.bodies.parametric import PLACE
 from framework.errors import ConfigError
 from framework.heads.posed_body import PosedBodyDensity, scene_of
-from framework.metric import HasFigure, Metric
+from framework.metric import Directions, HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.pose_error.errors import NEAR, FittedImage, place_errors
@@ -37,11 +37,7 @@ class PoseError(Metric, HasFigure):
         "translation_median_cm": "translation cm",
         "found": "within 2°, 1 cm",
     }
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {
-        "rotation_median_deg": "lower",
-        "translation_median_cm": "lower",
-        "found": "higher",
-    }
+    better: ClassVar[Directions] = {**dict.fromkeys(columns, "lower"), "found": "higher"}
     figure_name: ClassVar[str] = "pose"
     errors: list[Tensor] | Tensor
 

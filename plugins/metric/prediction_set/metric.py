@@ -1,14 +1,14 @@
 """Coverage and size of prediction sets, and share of empty sets."""
 
 import math
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from framework.distributions.protocol import value_set
 from framework.errors import UserError
-from framework.metric import Metric
+from framework.metric import Directions, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 
@@ -28,7 +28,7 @@ class PredictionSetMetric(Metric):
 
     bibtex = "vovk2005algorithmic"
     columns: ClassVar[dict[str, str]] = {}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {}
+    better: ClassVar[Directions] = {}
     count: Tensor
     covered: Tensor
     size: Tensor

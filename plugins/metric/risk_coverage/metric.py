@@ -10,7 +10,7 @@ from torchmetrics.utilities.data import dim_zero_cat
 from framework.distributions.checks import refuse_nan
 from framework.distributions.circular import angular_distance
 from framework.errors import ConfigError
-from framework.metric import HasFigure, Metric
+from framework.metric import Directions, HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.risk_coverage.functional import (
@@ -58,7 +58,7 @@ class RiskCoverage(Metric, HasFigure):
 
     bibtex = "geifman2017selective, geifman2019bias"
     columns: ClassVar[dict[str, str]] = {"aurc": "AURC", "risk_80": "risk at 80 %"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"aurc": "lower", "risk_80": "lower"}
+    better: ClassVar[Directions] = {"aurc": "lower", "risk_80": "lower"}
     figure_name: ClassVar[str] = "risk_coverage"
     confidences: list[Tensor] | Tensor
     risks: list[Tensor] | Tensor

@@ -1,7 +1,7 @@
 """Log-likelihood and spread of densities of rotations of symmetric objects (Murphy et al. 2021, §4.2)."""
 
 import math
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -13,7 +13,7 @@ from framework.distributions.circular import Circular
 from framework.errors import ConfigError, DataError
 from framework.geometry import quaternions
 from framework.geometry.symmetry import GROUPS, nearest_distance
-from framework.metric import Mean
+from framework.metric import Directions, Mean
 from framework.prediction import Prediction
 from framework.target import Target
 
@@ -59,11 +59,7 @@ class SymmetricRotation(Mean):
         "optimum_gap": "below optimum",
         "spread_deg": "spread °",
     }
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {
-        "rotation_log_likelihood": "higher",
-        "optimum_gap": "lower",
-        "spread_deg": "lower",
-    }
+    better: ClassVar[Directions] = {**dict.fromkeys(columns, "lower"), "rotation_log_likelihood": "higher"}
 
     def __init__(self, target: Target, *, draws: Annotated[int, Field(ge=1, le=100_000)] = 200) -> None:
         super().__init__()

@@ -1,7 +1,7 @@
 """Comparison of the predicted azimuth density with the true posterior of the azimuth of a symmetric object."""
 
 import math
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -12,7 +12,7 @@ from torch.distributions import Distribution
 from framework.distributions.checks import refuse_nan
 from framework.distributions.circular import grid, wrap
 from framework.errors import ConfigError, DataError
-from framework.metric import Metric
+from framework.metric import Directions, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 
@@ -52,10 +52,7 @@ class TruePosterior(Metric):
         "mode_mass_min": "least mode mass",
         "uniform_gap": "gap to uniform",
     }
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {
-        "mode_mass_min": "higher",
-        "uniform_gap": "lower",
-    }
+    better: ClassVar[Directions] = {"mode_mass_min": "higher", "uniform_gap": "lower"}
     count: Tensor
     entropy: Tensor
     samples_with: Tensor

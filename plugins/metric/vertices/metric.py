@@ -1,7 +1,7 @@
 """Distances between predicted and true vertices, and errors of the correspondences that predicted meshes give."""
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -10,7 +10,7 @@ from torchmetrics.utilities import dim_zero_cat
 
 from framework.errors import ConfigError, DataError
 from framework.geometry.clouds import denormalise_clouds
-from framework.metric import Mean, Metric
+from framework.metric import Directions, Mean, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.vertices.correspondence import correspondence
@@ -42,7 +42,7 @@ class VertexError(Mean):
         "vertex_error_median_cm": "median cm",
         "vertex_error_95_cm": "95 % cm",
     }
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "lower")
+    better: ClassVar[Directions] = dict.fromkeys(columns, "lower")
     histogram: Tensor
 
     def __init__(self, target: Target) -> None:
@@ -82,7 +82,7 @@ class CorrespondenceError(Metric):
 
     bibtex = FAUST
     columns: ClassVar[dict[str, str]] = {"intra_cm": "intra cm", "inter_cm": "inter cm"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "lower")
+    better: ClassVar[Directions] = dict.fromkeys(columns, "lower")
     registered: list[Tensor]
     truth: list[Tensor]
     subject: list[Tensor]

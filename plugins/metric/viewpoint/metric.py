@@ -1,7 +1,7 @@
 """Viewpoint accuracy Acc_π/6 and median error MedErr of Tulsiani & Malik (2015), by geodesic distance of rotations."""
 
 import math
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -9,7 +9,7 @@ from torchmetrics.utilities.data import dim_zero_cat
 
 from framework.errors import ConfigError
 from framework.geometry.rotation import geodesic_distance, viewpoint_rotation
-from framework.metric import Metric
+from framework.metric import Directions, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 
@@ -29,7 +29,7 @@ class Viewpoint(Metric):
 
     bibtex = "tulsiani2015viewpoints"
     columns: ClassVar[dict[str, str]] = {"acc_pi_6": "Acc π/6", "mederr_deg": "MedErr °"}
-    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"acc_pi_6": "higher", "mederr_deg": "lower"}
+    better: ClassVar[Directions] = {"acc_pi_6": "higher", "mederr_deg": "lower"}
     errors: list[Tensor] | Tensor
 
     def __init__(self, target: Target) -> None:
