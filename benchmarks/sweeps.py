@@ -4,12 +4,29 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import yaml
 
 if TYPE_CHECKING:
     from framework.training.batches import Batches
+
+
+class Run(NamedTuple):
+    """A finished run: its folder, and the content of its results.json."""
+
+    folder: Path
+    results: dict[str, Any]
+
+    def config(self) -> dict[str, Any]:
+        """Return the configuration of the run."""
+        return yaml.safe_load((self.folder / "config.yaml").read_text(encoding="utf-8"))
+
+
+def read_runs(*sweeps: str | Path) -> list[Run]:
+    """Return the finished runs of sweeps: one sweep after the other, the runs of each sweep by the names of folders."""
+    paths = [path for sweep in sweeps for path in sorted(Path(sweep).glob("*/results.json"))]
+    return [Run(path.parent, json.loads(path.read_text(encoding="utf-8"))) for path in paths]
 
 
 def record(run: Path) -> dict[str, Any]:

@@ -9,10 +9,9 @@
 Writes dales.md and dales.png into the folder of this file.
 """
 
-import json
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ import numpy as np
 import torch
 
 from benchmarks.pages import machine, publish
+from benchmarks.sweeps import Run, read_runs
 from benchmarks.timing import Rounds, time_interleaved
 from framework.configuration.loading import load_with_description
 from framework.configuration.schema import build, resolve
@@ -36,27 +36,22 @@ NAMES = {
     "dales/dgcnn_small": "DGCNN, small, 128 points",
 }
 """Names of the methods, by experiment; the first one is compared with the others."""
+CLASSIFICATION = {"method": "method", "accuracy": "accuracy", "nll": "NLL (nats)", "ece": "ECE"}
 COLUMNS = {
-    "method": "method",
-    "accuracy": "accuracy",
-    "nll": "NLL (nats)",
-    "ece": "ECE",
+    **CLASSIFICATION,
     "accuracy_spread": "spread over folds",
     "mflop": "MFLOP",
     "times": "ms per cloud",
 }
 BATCH = 16
 """Number of clouds that are predicted together where the time is measured."""
-Fold = Mapping[str, Any]
 
 
-def read_folds(sweep: Path) -> dict[str, list[Fold]]:
-    """Return the results and the folder ("run") of each run, as a list over the folds for each method."""
-    folds: dict[str, list[Fold]] = {}
-    for path in sorted(sweep.glob("*/results.json")):
-        results = json.loads(path.read_text(encoding="utf-8"))
-        folds.setdefault(results["experiment"], []).append({**results, "run": path.parent})
-    return {experiment: folds[experiment] for experiment in NAMES if experiment in folds}
+def runs_by_method(names: Iterable[str], *sweeps: str) -> dict[str, list[Run]]:
+    """Return the runs of each experiment, in the order of `names`; experiments that were not run are left out."""
+    runs = read_runs(*sweeps)
+    lists = {name: [run for run in runs if run.results["experiment"] == name] for name in names}
+    return {name: members for name, members in lists.items() if members}
 
 
 def measure_times(runs: Mapping[str, Path], **data_settings: object) -> dict[str, Rounds]:
@@ -84,24 +79,35 @@ def predict(model: Callable[[torch.Tensor], Any], clouds: torch.Tensor) -> torch
     return model(clouds).mode
 
 
-def over_folds(folds: Sequence[Fold], key: str) -> tuple[float, float]:
+def over_folds(folds: Sequence[Run], key: str) -> tuple[float, float]:
     """Return the mean of a metric over the folds, and its standard error over the test objects of all folds."""
-    values, errors = ([fold[name] for fold in folds] for name in (key, f"{key}_sem"))
+    values, errors = ([fold.results[name] for fold in folds] for name in (key, f"{key}_sem"))
     return float(np.mean(values)), math.sqrt(sum(error**2 for error in errors)) / len(folds)
 
 
-def row(experiment: str, folds: Sequence[Fold], times: Rounds) -> dict[str, object]:
-    """Return the row of a method."""
-    accuracy, nll = over_folds(folds, "accuracy"), over_folds(folds, "nll")
+def row(
+    method: str,
+    runs: Sequence[Run],
+    times: Rounds,
+    average: Callable[[Sequence[Run], str], tuple[float, float]],
+) -> dict[str, object]:
+    """Return the row of a method, without the columns that only one of the pages has.
+
+    Args:
+        method: name of the method.
+        runs: runs of the method.
+        times: run times of a prediction.
+        average: function of runs and of a metric's key that returns the mean of the metric and its standard error.
+    """
+    accuracy, nll = average(runs, "accuracy"), average(runs, "nll")
     return {
-        "method": NAMES[experiment],
+        "method": method,
         "accuracy": accuracy[0],
         "accuracy_sem": accuracy[1],
         "nll": nll[0],
         "nll_sem": nll[1],
-        "ece": float(np.mean([fold["ece"] for fold in folds])),
-        "accuracy_spread": float(np.std([fold["accuracy"] for fold in folds], ddof=1)),
-        "mflop": folds[0]["flops_per_sample"] / 1e6,
+        "ece": float(np.mean([run.results["ece"] for run in runs])),
+        "mflop": runs[0].results["flops_per_sample"] / 1e6,
         "milliseconds": times.median,
         "times": times.text(),
     }
@@ -165,13 +171,17 @@ def conclusion(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def main() -> None:
-    results = read_folds(Path(sys.argv[1]))
-    runs = {experiment: folds[0]["run"] for experiment, folds in results.items()}
-    times = measure_times(runs, root=str(Path(sys.argv[2]).absolute()))
-    rows = [row(experiment, folds, times[experiment]) for experiment, folds in results.items()]
+    runs = runs_by_method(NAMES, sys.argv[1])
+    first_folders = {experiment: folds[0].folder for experiment, folds in runs.items()}
+    times = measure_times(first_folders, root=str(Path(sys.argv[2]).absolute()))
+    rows = []
+    for experiment, folds in runs.items():
+        spread = float(np.std([fold.results["accuracy"] for fold in folds], ddof=1))
+        shared = row(NAMES[experiment], folds, times[experiment], over_folds)
+        rows.append({**shared, "accuracy_spread": spread})
     title = "Real objects of laser scans: accuracy, operations and run time"
     draw(rows, title, Path(__file__), synthetic=False)
-    count = sum(fold["test_samples"] for fold in next(iter(results.values())))
+    count = sum(fold.results["test_samples"] for fold in next(iter(runs.values())))
     epochs = "200 epochs, except PointNet (40 epochs) and DGCNN (20 epochs), whose epochs take far longer"
     text = (
         "# Objects of airborne laser scans (DALES, real data)\n\n"

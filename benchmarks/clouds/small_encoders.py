@@ -11,19 +11,24 @@
 Writes small_encoders.md and small_encoders.png into the folder of this file.
 """
 
-import json
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.clouds.dales import BATCH, conclusion, draw, measure_times
+from benchmarks.clouds.dales import (
+    BATCH,
+    CLASSIFICATION,
+    conclusion,
+    draw,
+    measure_times,
+    row,
+    runs_by_method,
+)
 from benchmarks.pages import machine, publish
-from benchmarks.sweeps import settings
-from benchmarks.timing import Rounds
+from benchmarks.sweeps import Run, settings
 from framework.reports.table import markdown
 
 NAMES = {
@@ -34,33 +39,13 @@ NAMES = {
 }
 """Names of the methods, by experiment."""
 COLUMNS = {
-    "method": "method",
-    "accuracy": "accuracy",
-    "nll": "NLL (nats)",
-    "ece": "ECE",
+    **CLASSIFICATION,
     "mflop": "MFLOP",
     "parameters": "parameters",
     "times": "ms per cloud",
     "epochs": "epochs",
     "seeds": "seeds",
 }
-
-
-class Run(NamedTuple):
-    """A finished run: its folder, and the numbers of its results.json."""
-
-    folder: Path
-    results: Mapping[str, Any]
-
-
-def read_runs(sweeps: Sequence[Path]) -> dict[str, list[Run]]:
-    """Return the runs of each method, in the order of `NAMES`."""
-    runs: dict[str, list[Run]] = {experiment: [] for experiment in NAMES}
-    for sweep in sweeps:
-        for path in sorted(sweep.glob("*/results.json")):
-            results = json.loads(path.read_text(encoding="utf-8"))
-            runs[results["experiment"]].append(Run(path.parent, results))
-    return {experiment: members for experiment, members in runs.items() if members}
 
 
 def over_seeds(runs: Sequence[Run], key: str) -> tuple[float, float]:
@@ -74,30 +59,19 @@ def over_seeds(runs: Sequence[Run], key: str) -> tuple[float, float]:
     return float(np.mean(values)), math.sqrt(clouds + seeds)
 
 
-def row(experiment: str, runs: Sequence[Run], times: Rounds) -> dict[str, object]:
-    """Return the row of a method."""
-    accuracy, nll = over_seeds(runs, "accuracy"), over_seeds(runs, "nll")
-    return {
-        "method": NAMES[experiment],
-        "accuracy": accuracy[0],
-        "accuracy_sem": accuracy[1],
-        "nll": nll[0],
-        "nll_sem": nll[1],
-        "ece": float(np.mean([run.results["ece"] for run in runs])),
-        "mflop": runs[0].results["flops_per_sample"] / 1e6,
-        "parameters": runs[0].results["parameters"],
-        "milliseconds": times.median,
-        "times": times.text(),
-        "epochs": settings([run.folder for run in runs], "trainer.max_epochs")[0],
-        "seeds": len(runs),
-        "synthetic": True,
-    }
-
-
 def main() -> None:
-    runs = read_runs([Path(folder) for folder in sys.argv[1:]])
+    runs = runs_by_method(NAMES, *sys.argv[1:])
     times = measure_times({experiment: members[0].folder for experiment, members in runs.items()})
-    rows = [row(experiment, members, times[experiment]) for experiment, members in runs.items()]
+    rows = [
+        {
+            **row(NAMES[experiment], members, times[experiment], over_seeds),
+            "parameters": members[0].results["parameters"],
+            "epochs": settings([run.folder for run in members], "trainer.max_epochs")[0],
+            "seeds": len(members),
+            "synthetic": True,
+        }
+        for experiment, members in runs.items()
+    ]
     draw(rows, "Cloud encoders: accuracy, operations and run time", Path(__file__), synthetic=True)
     tested = sorted({run.results["test_samples"] for members in runs.values() for run in members})
     missing = [name for experiment, name in NAMES.items() if experiment not in runs]

@@ -7,11 +7,10 @@
 Writes coil20.md into the folder of this file.
 """
 
-import json
 import sys
-from pathlib import Path
 
 from benchmarks.pages import machine, publish
+from benchmarks.sweeps import read_runs
 from framework.reports.table import aggregate, markdown
 
 COLUMNS = {
@@ -28,8 +27,7 @@ COLUMNS = {
 
 def main() -> None:
     rows = []
-    for path in sorted(Path(sys.argv[1]).glob("*/results.json")):
-        results = json.loads(path.read_text(encoding="utf-8"))
+    for _, results in read_runs(sys.argv[1]):
         shared_keys = ("method", "seed", "synthetic", "milliseconds_per_sample", "parameters")
         shared = {key: results[key] for key in shared_keys}
         for objects, numbers in {"all": results, **results["groups"]}.items():

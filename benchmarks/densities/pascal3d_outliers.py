@@ -8,13 +8,10 @@
 Writes pascal3d_outliers.md into the folder of this file.
 """
 
-import json
 import sys
-from pathlib import Path
-
-import yaml
 
 from benchmarks.pages import machine, publish
+from benchmarks.sweeps import read_runs
 from framework.reports.table import markdown
 
 COLUMNS = {
@@ -32,11 +29,10 @@ COLUMNS = {
 
 def main() -> None:
     rows = []
-    for path in sorted(Path(sys.argv[1]).glob("*/results.json")):
-        results = json.loads(path.read_text(encoding="utf-8"))
+    for run in read_runs(sys.argv[1]):
+        results = run.results
         columns = {key: value for key, value in results.items() if key.removesuffix("_sem") in COLUMNS}
-        config = yaml.safe_load((path.parent / "config.yaml").read_text(encoding="utf-8"))
-        weight = (config.get("objective") or {}).get("outlier_exposure", {}).get("weight")
+        weight = (run.config().get("objective") or {}).get("outlier_exposure", {}).get("weight")
         if weight is not None:
             columns["method"] = f"outlier_exposure, λ = {weight:g}"
         rows.append({**columns, "synthetic": results["synthetic"]})

@@ -24,6 +24,7 @@ from torch import Tensor
 import framework
 from benchmarks.commands import ROOT, carry_out
 from benchmarks.pages import machine, publish
+from benchmarks.sweeps import Run, read_runs
 from framework.configuration.schema import build, resolve
 from framework.datasets.fields import fetch
 
@@ -88,13 +89,11 @@ def _run(*words: str) -> None:
     carry_out([sys.executable, "-m", "framework", *words])
 
 
-def read_runs(name: str) -> dict[str, list[tuple[Path, Mapping[str, Any]]]]:
+def runs_by_head(name: str) -> dict[str, list[Run]]:
     """Return the runs of a sweep, with their results, by density head."""
-    runs: dict[str, list[tuple[Path, Mapping[str, Any]]]] = {head: [] for head in HEADS}
-    for file in sorted(_folder(name).glob("*/results.json")):
-        config = yaml.safe_load((file.parent / "config.yaml").read_text(encoding="utf-8"))
-        results = json.loads(file.read_text(encoding="utf-8"))
-        runs[config["density_head"]["name"]].append((file.parent, results))
+    runs: dict[str, list[Run]] = {head: [] for head in HEADS}
+    for run in read_runs(_folder(name)):
+        runs[run.config()["density_head"]["name"]].append(run)
     return runs
 
 
@@ -138,7 +137,7 @@ def with_spread(values: Sequence[float]) -> str:
 
 def likelihood_table() -> tuple[list[str], str]:
     """Return the table of log-likelihoods on ambiguous digits, and a sentence about the target."""
-    runs = read_runs("ambiguous")
+    runs = runs_by_head("ambiguous")
     scores = {head: [result["log_likelihood"] for _, result in runs[head]] for head in HEADS}
     lines = [
         f"| density head | log-likelihood, nats | {' | '.join(f'digit {digit}' for digit in AMBIGUOUS)} | ms / image |",
@@ -168,7 +167,7 @@ def reading_table() -> tuple[list[str], str]:
         "|---|---:|---:|---:|",
     ]
     shares: dict[str, float] = {}
-    runs = read_runs("pair")
+    runs = runs_by_head("pair")
     for head in HEADS:
         means: list[list[float]] = []
         for run, _ in runs[head]:
@@ -196,10 +195,10 @@ def corruption_rows() -> list[dict[str, Any]]:
     """Return one row for each corruption and strength; strength 0 stands for the clean images."""
     clean = json.loads((_folder("classes") / "results.json").read_text(encoding="utf-8"))
     rows = [{"corruption": kind, "strength": 0, **_scores(clean)} for kind in CORRUPTIONS]
-    for file in sorted(_folder("corrupted").glob("*/results.json")):
-        words = yaml.safe_load((file.parent / "overrides.yaml").read_text(encoding="utf-8"))
+    for folder, results in read_runs(_folder("corrupted")):
+        words = yaml.safe_load((folder / "overrides.yaml").read_text(encoding="utf-8"))
         overrides = dict(word.removeprefix("+stored.").split("=", 1) for word in words)
-        scores = _scores(json.loads(file.read_text(encoding="utf-8")))
+        scores = _scores(results)
         rows.append(
             {
                 "corruption": overrides["data.corruption"],
@@ -245,7 +244,7 @@ def draw_densities(file: Path) -> None:
     figure = Figure(figsize=(9, 4), layout="constrained")
     grid = figure.subplots(2, len(columns), height_ratios=(1, 1.6))
     for column, (name, digit, group) in enumerate(columns):
-        runs = {head: chosen[0][0] for head, chosen in read_runs(name).items()}
+        runs = {head: chosen[0].folder for head, chosen in runs_by_head(name).items()}
         test = test_images(runs[HEADS[0]])
         index = int((test["group"] == group).nonzero()[0])
         image, target = test["input"][index : index + 1], float(test["target"][index, 0])

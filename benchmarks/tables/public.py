@@ -8,7 +8,6 @@ but the seed of the split, and records the results in public_splits.csv. `page` 
 """
 
 import argparse
-import json
 import shutil
 import sys
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 
 from benchmarks.commands import ROOT, carry_out
 from benchmarks.pages import machine, publish, read_rows
+from benchmarks.sweeps import read_runs
 from benchmarks.tables.uci import with_error
 from framework.reports.table import write_csv
 
@@ -84,9 +84,8 @@ def run(name: str, jobs: int) -> None:
     command += ["data.target=target", f"data.data_seed={seeds}", "logger=none", "pictures=false", "threads=1"]
     carry_out([*command, f"hydra.sweep.dir={folder}", f"hydra.launcher.jobs={jobs}"])
     rows = []
-    for path in sorted(folder.glob("*/results.json"), key=lambda path: int(path.parent.name)):
-        results = json.loads(path.read_text(encoding="utf-8"))
-        seed = int(path.parent.name)
+    for run, results in sorted(read_runs(folder), key=lambda run: int(run.folder.name)):
+        seed = int(run.name)
         covered = results.get("coverage_90", results.get("set_coverage"))
         line = {"table": name, "method": "recommended start", "seed": seed, "covered": covered}
         rows.append({**line, "log_likelihood": results["log_likelihood"]})

@@ -7,7 +7,6 @@ writes moons.md, moons_landscapes.png and moons_reliability.png beside this file
 only draws the figures.
 """
 
-import json
 import sys
 from io import BytesIO
 from pathlib import Path
@@ -15,14 +14,13 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-import yaml
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 import framework
 from benchmarks.pages import machine, publish
-from benchmarks.sweeps import processor_seconds, record
+from benchmarks.sweeps import processor_seconds, read_runs, record
 from framework.configuration.schema import build, resolve
 from framework.distributions.class_probabilities import class_probabilities
 from framework.evaluation.splits import cost, evaluate
@@ -108,11 +106,9 @@ def variant(config: dict[str, Any], experiment: str) -> str:
 
 def read_results(sweeps: list[Path]) -> list[dict[str, Any]]:
     rows = []
-    for path in sorted(path for sweep in sweeps for path in sweep.glob("*/results.json")):
-        numbers = json.loads(path.read_text(encoding="utf-8"))
-        key = variant(
-            yaml.safe_load((path.parent / "config.yaml").read_text(encoding="utf-8")), numbers["experiment"]
-        )
+    for run in read_runs(*sorted(sweeps)):
+        numbers = run.results
+        key = variant(run.config(), numbers["experiment"])
         selected = {name: numbers[name] for name in COLUMNS if name in numbers}
         rows.append(
             {
@@ -120,9 +116,9 @@ def read_results(sweeps: list[Path]) -> list[dict[str, Any]]:
                 "key": key,
                 "method": METHODS[key],
                 "seed": numbers["seed"],
-                "folder": str(path.parent),
+                "folder": str(run.folder),
             }
-            | {"seconds": processor_seconds(record(path.parent)), "synthetic": numbers["synthetic"]}
+            | {"seconds": processor_seconds(record(run.folder)), "synthetic": numbers["synthetic"]}
         )
     order = list(METHODS)
     return sorted(rows, key=lambda row: (order.index(row["key"]), row["seed"]))

@@ -9,7 +9,6 @@ often it confidently takes the back for the front (Figure 3.6), and whether the 
 (§3.1, eq. 3.23). It writes azimuths.md beside this file.
 """
 
-import json
 import math
 import sys
 from collections.abc import Callable, Sequence
@@ -23,7 +22,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from benchmarks.pages import machine, publish
-from benchmarks.sweeps import processor_seconds, record
+from benchmarks.sweeps import processor_seconds, read_runs, record
 from framework.configuration.assembly import build_data
 from framework.configuration.loading import load_with_description
 from framework.distributions.circular import angular_distance, grid
@@ -155,10 +154,9 @@ def main() -> None:
     values_by_method: dict[str, dict[str, list[list[float]]]] = {method: {} for method in METHODS}
     minutes: dict[str, dict[str, list[float]]] = {method: {} for method in METHODS}
     runs = 0
-    for path in sorted(path for folder in sys.argv[1:] for path in Path(folder).glob("*/results.json")):
-        row = json.loads(path.read_text(encoding="utf-8"))
-        minutes[row["method"]].setdefault(row["data"], []).append(processor_seconds(record(path.parent)) / 60)
-        scores = score_run(path.parent, loaders)
+    for folder, row in read_runs(*sorted(map(Path, sys.argv[1:]))):
+        minutes[row["method"]].setdefault(row["data"], []).append(processor_seconds(record(folder)) / 60)
+        scores = score_run(folder, loaders)
         if scores is not None:
             values = [question(scores) for question in STATISTICS.values()]
             values_by_method[row["method"]].setdefault(row["data"], []).append(values)

@@ -10,16 +10,15 @@ blur.png again from blur.csv.
 """
 
 import argparse
-import json
 import math
 from pathlib import Path
 
 import numpy as np
 import torch
-import yaml
 from matplotlib.axes import Axes
 
 from benchmarks.pages import machine, publish, read_rows
+from benchmarks.sweeps import read_runs
 from framework.configuration.loading import load_with_description
 from framework.configuration.schema import build
 from framework.datasets.images import blur, to_rgb8
@@ -168,22 +167,14 @@ def draw_strip(
     save_figure(figure, path.with_suffix(""), True)
 
 
-def find_pan_runs(sweeps: list[Path]) -> list[Path]:
-    """Return the results.json of the runs that predict the pan angle alone."""
-    result_paths = []
-    for path in (path for sweep in sweeps for path in sorted(sweep.glob("*/results.json"))):
-        angles = yaml.safe_load((path.parent / "config.yaml").read_text(encoding="utf-8"))["data"]["angles"]
-        if list(angles) == ["pan"]:
-            result_paths.append(path)
-    return result_paths
-
-
 def main(sweeps: list[Path], root: str | None) -> None:
     rows, models = [], {}
     fields: dict[str, torch.Tensor] = {}
-    for result in find_pan_runs(sweeps):
-        row = json.loads(result.read_text(encoding="utf-8"))
-        model, description = load_with_description(result.parent)
+    for run in read_runs(*sweeps):
+        if list(run.config()["data"]["angles"]) != ["pan"]:
+            continue
+        row = run.results
+        model, description = load_with_description(run.folder)
         if not fields:
             real = {} if root is None else {"root": root}
             data = build("data", description.config["data"] | real)

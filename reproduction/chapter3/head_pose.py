@@ -6,7 +6,6 @@ To evaluate sweeps that have already run: `python -m reproduction.chapter3.head_
 script writes head_pose.md beside this file.
 """
 
-import json
 import sys
 from itertools import groupby
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 import torch
 
 from benchmarks.pages import machine, publish
-from benchmarks.sweeps import milliseconds_per_sample, processor_seconds, record, settings
+from benchmarks.sweeps import Run, milliseconds_per_sample, processor_seconds, read_runs, record, settings
 from framework.reports.table import Better, aggregate, markdown
 from framework.training.batches import Batches
 
@@ -62,20 +61,19 @@ THESIS = {
 (§3.6.1)."""
 
 
-def read_results(folders: list[Path]) -> list[dict[str, Any]]:
+def read_results(runs: list[Run]) -> list[dict[str, Any]]:
     torch.set_num_threads(1)
     loaders: dict[str, Batches] = {}
     rows = []
-    for path in (path for folder in folders for path in folder.glob("*/results.json")):
-        numbers = json.loads(path.read_text(encoding="utf-8"))
-        job = record(path.parent)
+    for run, numbers in runs:
+        job = record(run)
         data, _, method = numbers["experiment"].partition("/")
         if "density_head.backbones=each" in job["overrides"]:
             method += "_each"
         angles = [word for word in job["overrides"] if word.startswith("data.angles=")]
         angle = angles[0].partition("=")[2].strip("[]") if angles else "pan"
         costs = {
-            "milliseconds_per_sample": milliseconds_per_sample(path.parent, loaders),
+            "milliseconds_per_sample": milliseconds_per_sample(run, loaders),
             "minutes": processor_seconds(job) / 60,
         }
         rows.append(numbers | {"data": data, "angle": angle, "method": method} | costs)
@@ -111,10 +109,10 @@ def difference_table(rows: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    folders = [Path(folder) for folder in sys.argv[1:]]
-    rows = read_results(folders)
+    runs = read_runs(*sys.argv[1:])
+    rows = read_results(runs)
     size, epochs, batch, precision = settings(
-        [path.parent for folder in folders for path in folder.glob("*/results.json")],
+        [folder for folder, _ in runs],
         *("data.image_size", "trainer.max_epochs", "batch_size", "trainer.precision"),
     )
     tables = []

@@ -8,16 +8,14 @@ The script measures the run time of a prediction again with one model at a time,
 each other. It writes pascal3d.md beside this file.
 """
 
-import json
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
 from benchmarks.pages import machine, publish
-from benchmarks.sweeps import milliseconds_per_sample, settings
+from benchmarks.sweeps import milliseconds_per_sample, read_runs, settings
 from framework.reports.table import aggregate, markdown
 from framework.training.batches import Batches
 
@@ -99,15 +97,14 @@ def main() -> None:
     torch.set_num_threads(1)
     loaders: dict[str, Batches] = {}
     rows = []
-    paths = [path for folder in sys.argv[1:] for path in Path(folder).glob("*/results.json")]
+    runs = read_runs(*sys.argv[1:])
     size, epochs, batch = settings(
-        [path.parent for path in paths], "data.image_size", "trainer.max_epochs", "batch_size"
+        [folder for folder, _ in runs], "data.image_size", "trainer.max_epochs", "batch_size"
     )
-    for path in paths:
-        row = json.loads(path.read_text(encoding="utf-8"))
+    for folder, row in runs:
         name = row["data"].removeprefix("pascal3d ")
         rows.append(
-            {**row, "data": name, "milliseconds_per_sample": milliseconds_per_sample(path.parent, loaders)}
+            {**row, "data": name, "milliseconds_per_sample": milliseconds_per_sample(folder, loaders)}
         )
     rows.sort(key=lambda row: (row["data"], METHODS.index(row["method"]), row["seed"]))
     compared = aggregate(rows, by=["data", "method"])

@@ -15,7 +15,6 @@ again, so that methods are compared cloud by cloud, which takes some minutes mor
 file.
 """
 
-import json
 import math
 import statistics
 import sys
@@ -27,13 +26,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-import yaml
 from jaxtyping import Float
 from torch import Tensor
 
 import framework
 from benchmarks.pages import machine, publish
-from benchmarks.sweeps import processor_seconds, record
+from benchmarks.sweeps import processor_seconds, read_runs, record
 from framework.configuration.schema import build, resolve
 from framework.distributions.class_probabilities import class_probabilities
 from framework.errors import DataError
@@ -335,9 +333,8 @@ def score_runs(sweep: Path, clouds: Tensor, labels: Tensor) -> list[dict[str, An
         DataError: A run was tested on other data than the present test split.
     """
     rows = []
-    for path in sorted(sweep.glob("*/results.json")):
-        numbers = json.loads(path.read_text(encoding="utf-8"))
-        config = yaml.safe_load((path.parent / "config.yaml").read_text(encoding="utf-8"))
+    for run in read_runs(sweep):
+        numbers, config = run.results, run.config()
         key = numbers["experiment"].rpartition("/")[2]
         table, method, *thesis = ROWS[key]
         if "conv3d" in key:
@@ -352,11 +349,11 @@ def score_runs(sweep: Path, clouds: Tensor, labels: Tensor) -> list[dict[str, An
                 f"{method}, {config['data']['rotations']} rotated copies of each cloud",
                 f"{key} turned",
             )
-        model = framework.load(path.parent)
+        model = framework.load(run.folder)
         right, nll, block_seconds = score_clouds(model, clouds, labels)
         if abs(right.mean() - numbers["accuracy"]) > 2 / len(right):
             raise DataError(
-                f"{path.parent}: the accuracy on the present test clouds is {right.mean():.4f}, but results.json holds "
+                f"{run.folder}: the accuracy on the present test clouds is {right.mean():.4f}, but results.json holds "
                 f"{numbers['accuracy']:.4f}. The run was made on other data. Repeat the run."
             )
         with torch.inference_mode():
@@ -376,8 +373,8 @@ def score_runs(sweep: Path, clouds: Tensor, labels: Tensor) -> list[dict[str, An
                 "nlls": nll,
             }
             | {"one_ms": 1e3 * single_seconds, "many_ms": 1e3 * block_seconds}
-            | {"megabytes": (path.parent / "checkpoints" / "model.ckpt").stat().st_size / 1e6}
-            | {"seconds": processor_seconds(record(path.parent)), "synthetic": numbers["synthetic"]}
+            | {"megabytes": (run.folder / "checkpoints" / "model.ckpt").stat().st_size / 1e6}
+            | {"seconds": processor_seconds(record(run.folder)), "synthetic": numbers["synthetic"]}
             | {"epochs": "at once" if fitted else str(config["trainer"]["max_epochs"])}
         )
     return rows
