@@ -1,25 +1,26 @@
 """The conditional variational autoencoder: its networks, its two lower bounds, and the density head."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float
-from pydantic import Field
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from framework.density_head import DensityHead
 from framework.distributions.protocol import tempered_density
-from framework.heads.parameters import require_finite, require_trained
+from framework.heads.parameters import require_finite
 from framework.heads.unit import Unit
-from framework.storage.limits import MOST_DRAWS
 from framework.target import Target
 from plugins.density_head.latent.decoder import LARGEST_FEATURE, LatentDecoder
 from plugins.density_head.latent.density import MODERATE, Latent, LatentDensity
+from plugins.density_head.latent.head import LatentHead, LatentSettings
 from plugins.density_head.latent.monte_carlo import Effort
+
+DEFAULT_SETTINGS = LatentSettings(latent=8, training_samples=10)
 
 LARGEST_LOG_SCALE = 7.0
 """Bound on the log standard deviations of z, so that no ratio of two standard deviations overflows."""
@@ -143,7 +144,7 @@ def evidence_bound(networks: Networks, value: Tensor, samples: int) -> Tensor:
     return likelihood.mean(0) - kl_divergence(posterior, networks.prior)
 
 
-class CVAEHead(DensityHead):
+class CVAEHead(LatentHead):
     """CVAE: an infinite mixture over a latent z with a learned prior (thesis §3.5.2, eq. 3.12-3.20).
 
     x is the input, φ the target and z a latent vector. Three networks, the prior p(z|x), the encoder q(z|x,φ) and the
@@ -152,42 +153,27 @@ class CVAEHead(DensityHead):
     layer that the framework puts before the head, so it is computed once per input and not once per sample.
 
     Args:
-        latent: dimensions of z.
-        hidden: width of each of the three networks.
-        training_samples: number S of samples of z in the training loss.
-        samples: number S of samples of z in evaluation, for the bound and for the mixture that gives mode and entropy;
-            may be set at any time.
-        tolerance: largest estimated error of log_prob in evaluation, nats; may be set at any time. If it is set,
-            log_prob first draws S samples and doubles them until its estimated error is below the tolerance. None: S
-            samples.
+        settings: size of each of the three networks, and number of samples of z. In evaluation, the samples serve the
+            bound, and the mixture that gives mode and entropy.
         backbones: "shared": prior, encoder and decoder read the features of one network; "each": each of the three
             reads the features of its own network, of the same architecture (thesis §3.6.1).
         component: the head whose densities are mixed.
     """
 
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"samples": (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)}
     bibtex = "sohn2015learning, burda2016importance"
 
     def __init__(
         self,
         target: Target,
         *,
-        latent: Annotated[int, Field(ge=1)] = 8,
-        hidden: Annotated[int, Field(ge=1)] = 128,
-        training_samples: Annotated[int, Field(ge=1, le=MOST_DRAWS)] = 10,
-        samples: Annotated[int, Field(ge=1, le=MOST_DRAWS)] = 500,
-        tolerance: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None,
+        settings: LatentSettings = DEFAULT_SETTINGS,
         backbones: Literal["shared", "each"] = "shared",
         component: DensityHead = MODERATE,  # pyright: ignore[reportArgumentType]  # built by the framework
     ) -> None:
-        super().__init__()
+        super().__init__(settings, component)
+        latent, hidden = settings.latent, settings.hidden
         self.target = target
         self.unit = Unit.of(target)
-        self.hidden = hidden
-        self.training_samples = training_samples
-        self.samples = samples
-        self.tolerance = tolerance
-        self.component = require_trained(component)
         self.prior = _layers_after_first(hidden, 2 * latent)
         self.from_value = nn.Linear(
             len(target.names) * (2 if target.kind == "angle" else 1), hidden, bias=False
@@ -201,7 +187,7 @@ class CVAEHead(DensityHead):
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> LatentDensity:
         """Return the density for raw parameters."""
-        effort = Effort(self.training_samples) if self.training else Effort(self.samples, self.tolerance)
+        effort = Effort(self.training_samples) if self.training else self.effort()
         return LatentDensity(self.networks(raw), effort)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:

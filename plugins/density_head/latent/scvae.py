@@ -1,24 +1,23 @@
 """The simplified conditional variational autoencoder: its decoder for one batch, and the density head."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar
 
 import torch
 from jaxtyping import Float
-from pydantic import Field
 from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.density_head import DensityHead
 from framework.distributions.density import Mixture
 from framework.distributions.protocol import tempered_density
-from framework.heads.parameters import require_finite, require_trained
-from framework.storage.limits import MOST_DRAWS
+from framework.heads.parameters import require_finite
 from framework.target import Target
 from plugins.density_head.latent.decoder import LatentDecoder
 from plugins.density_head.latent.density import MODERATE, Latent, LatentDensity, sampled_mixture
-from plugins.density_head.latent.monte_carlo import Effort
+from plugins.density_head.latent.head import LatentHead, LatentSettings
+
+DEFAULT_SETTINGS = LatentSettings(latent=2, training_samples=50)
 
 
 @dataclass(frozen=True)
@@ -69,45 +68,28 @@ class Networks(Latent):
         return replace(self, component=lambda raw: tempered_density(self.component(raw), temperature))
 
 
-class SCVAEHead(DensityHead):
+class SCVAEHead(LatentHead):
     """Simplified CVAE: an infinite mixture over z ~ N(0, I) (thesis §3.5.2, eq. 3.21-3.22).
 
     A decoder (plugins.density_head.latent.decoder) turns features and z into a component.
 
     Args:
-        latent: dimensions of z.
-        hidden: width of the decoder.
-        training_samples: number S of samples of z in the training loss.
-        samples: number S of samples of z in evaluation; may be set at any time. The density keeps S components per
-            input, so that memory grows as batch × S × (raw parameters of a component).
-        tolerance: largest estimated error of log_prob in evaluation, nats; may be set at any time. If it is set,
-            log_prob first draws S samples and doubles them until its estimated error is below the tolerance. None: S
-            samples, and the density is a mixture of S components.
+        settings: size of the decoder, and number S of samples of z. Without a tolerance, the density in evaluation is a
+            mixture of S components for each input, so that memory grows as batch × S × (raw parameters of a component).
         component: the head whose densities are mixed.
     """
 
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"samples": (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)}
     bibtex = "prokudin2018deep"
 
     def __init__(
         self,
         target: Target,
         *,
-        latent: Annotated[int, Field(ge=1)] = 2,
-        hidden: Annotated[int, Field(ge=1)] = 128,
-        training_samples: Annotated[int, Field(ge=1, le=MOST_DRAWS)] = 50,
-        samples: Annotated[int, Field(ge=1, le=MOST_DRAWS)] = 500,
-        tolerance: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None,
+        settings: LatentSettings = DEFAULT_SETTINGS,
         component: DensityHead = MODERATE,  # pyright: ignore[reportArgumentType]  # built by the framework
     ) -> None:
-        super().__init__()
-        self.latent = latent
-        self.training_samples = training_samples
-        self.samples = samples
-        self.tolerance = tolerance
-        self.hidden = hidden
-        self.component = require_trained(component)
-        self.decoder = LatentDecoder(latent, hidden, component.size)
+        super().__init__(settings, component)
+        self.decoder = LatentDecoder(self.latent, self.hidden, component.size)
         self.size = self.decoder.size
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
@@ -123,7 +105,7 @@ class SCVAEHead(DensityHead):
             return Mixture(weights, self.component(number))
         center = torch.zeros(*raw.shape[:-1], self.latent, dtype=kind, device=raw.device)
         networks = Networks(raw, self.decoder, self.component, center, self.hidden, self.component.size)
-        effort = Effort(self.samples, self.tolerance)
+        effort = self.effort()
         if self.tolerance is None:
             return sampled_mixture(networks, networks.points(effort), effort)
         return LatentDensity(networks, effort)

@@ -26,6 +26,7 @@ from plugins.density_head.latent.cvae import (
     importance_log_weights,
     kl_divergence,
 )
+from plugins.density_head.latent.head import LatentSettings
 from plugins.density_head.latent.rows import ONE, SMALL, TWO
 
 
@@ -126,7 +127,7 @@ def raws(head, *batch):
     [(Target("real", ("x", "y")), NormalHead), (Target("class", ("a", "b", "c")), CategoricalHead)],
 )
 def test_targets_that_are_not_angles(target, component):
-    head = CVAEHead(target, **SMALL, component=component(target)).eval()
+    head = CVAEHead(target, settings=LatentSettings(**SMALL), component=component(target)).eval()
     raw, value = raws(head, 4), values(target, (4,))
     with torch.no_grad():
         density = head(raw)
