@@ -497,8 +497,8 @@ class ValueSet(ABC):
 def value_set(density: Distribution) -> ValueSet | None:
     """Return the prediction sets of a density, one for each item of its batch; None if it has none.
 
-    The default returns None. A mixture, a power or a marginal of a density with sets has no sets, since a guarantee
-    for this density does not hold for the changed one. An affine transform (`affine.AffineDensity`) has the transformed
-    sets.
+    By default, a density that is a `ValueSet` is returned itself, and other densities have none. A mixture, a power or
+    a marginal of a density with sets has no sets, since a guarantee for this density does not hold for the changed one.
+    An affine transform (`affine.AffineDensity`) has the transformed sets.
     """
-    return None
+    return density if isinstance(density, ValueSet) else None

@@ -60,10 +60,14 @@ def outlier_score(density: Distribution) -> Float[Tensor, "*batch"] | None:
 
     A score is high for inputs unlike the training data. Its unit depends on the wrapper that computes it; only the
     order of scores has a meaning. The default returns None. A mixture, a power or a marginal of a density with a score
-    has no score. An affine transform of a density has the score of this density. A density that leaves another density
-    unchanged registers a function that returns the score of this other density.
+    has no score. An affine transform of a density has the score of this density, and so has an `Unchanged` density.
     """
     return None
+
+
+@outlier_score.register
+def _(density: Unchanged) -> Float[Tensor, "*batch"] | None:
+    return outlier_score(density.density)
 
 
 @outlier_score.register

@@ -35,7 +35,6 @@ class LPIPS(PerImage):
     """
 
     bibtex = "zhang2018unreasonable"
-    reads: ClassVar[frozenset[str]] = frozenset({"color"})
     columns: ClassVar[dict[str, str]] = {"lpips": "LPIPS", "lpips_masked": "LPIPS in mask"}
     better: ClassVar[Directions] = dict.fromkeys(columns, "lower")
     figure_name: ClassVar[str] = "lpips"

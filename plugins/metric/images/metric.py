@@ -51,7 +51,6 @@ class PSNR(PerImage):
     """
 
     bibtex = "huynhthu2008scope"
-    reads: ClassVar[frozenset[str]] = frozenset({"color"})
     columns: ClassVar[dict[str, str]] = {"psnr_db": "PSNR dB", "psnr_masked_db": "PSNR in mask, dB"}
     better: ClassVar[Directions] = dict.fromkeys(columns, "higher")
     figure_name: ClassVar[str] = "psnr"
@@ -91,7 +90,6 @@ class SSIM(PerImage):
     """
 
     bibtex = "wang2004image"
-    reads: ClassVar[frozenset[str]] = frozenset({"color"})
     columns: ClassVar[dict[str, str]] = {"ssim": "SSIM", "ssim_masked": "SSIM in mask"}
     better: ClassVar[Directions] = dict.fromkeys(columns, "higher")
     figure_name: ClassVar[str] = "ssim"
@@ -121,7 +119,6 @@ class MSSSIM(PerImage):
     """
 
     bibtex = "wang2003multiscale"
-    reads: ClassVar[frozenset[str]] = frozenset({"color"})
     columns: ClassVar[dict[str, str]] = {"ms_ssim": "MS-SSIM"}
     better: ClassVar[Directions] = dict.fromkeys(columns, "higher")
     figure_name: ClassVar[str] = "ms_ssim"

@@ -2,7 +2,7 @@
 
 import math
 from abc import abstractmethod
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class PerImage(Metric, HasFigure):
-    """Base class of metrics that evaluate images one by one, in the channel that `reads` names.
+    """Base class of metrics that evaluate images one by one, in the channel that `reads` names, by default the colours.
 
     `judge` returns the numbers of one image; images are ranked by the first number. A number is NaN if it is not
     defined for an image; mean and standard error are over the other images. The metric keeps the numbers of all images,
@@ -31,6 +31,7 @@ class PerImage(Metric, HasFigure):
         DataError: a batch has no true image; or predicted and true images do not fit together, or contain NaN.
     """
 
+    reads: ClassVar[frozenset[str]] = frozenset({"color"})
     keys: tuple[str, ...]
     masked: bool
     """True if `judge` receives the true masks."""

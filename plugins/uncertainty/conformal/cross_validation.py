@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions.exported import Exported, exported
-from framework.distributions.protocol import ValueSet, marginal, median, value_set
-from framework.distributions.unchanged import Unchanged, outlier_score
+from framework.distributions.protocol import ValueSet, marginal, median
+from framework.distributions.unchanged import Unchanged
 from framework.errors import ConfigError
 from framework.model import Predictor
 from framework.uncertainty import SelfTraining
@@ -118,16 +118,6 @@ class IntervalSet(Unchanged, ValueSet):
     def parts(self) -> list[list[tuple[float, float]]]:
         """Return the intervals of every item, as `intervals` does."""
         return self.intervals()
-
-
-@value_set.register
-def _(density: IntervalSet) -> IntervalSet:
-    return density
-
-
-@outlier_score.register
-def _(density: IntervalSet) -> Float[Tensor, "*batch"] | None:
-    return outlier_score(density.density)
 
 
 @marginal.register

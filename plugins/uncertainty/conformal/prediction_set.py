@@ -12,8 +12,8 @@ from torch.distributions import Distribution, constraints
 from framework.distributions.circular import Circular
 from framework.distributions.exported import Exported, exported
 from framework.distributions.intervals import central_interval
-from framework.distributions.protocol import ValueSet, mahalanobis, marginal, value_set
-from framework.distributions.unchanged import Unchanged, outlier_score
+from framework.distributions.protocol import ValueSet, mahalanobis, marginal
+from framework.distributions.unchanged import Unchanged
 from framework.errors import ConfigError, UserError
 from plugins.uncertainty.conformal.highest_density import Ends, Line
 
@@ -377,16 +377,6 @@ def _share_scores(log_prob: Tensor, log_draws: Float[Tensor, "draw *batch"]) -> 
     beyond = (edges[..., :1] - flat).clamp(min=0)
     score = math.log(len(log_draws) + 1) - (rank + 1).log() + beyond
     return score.movedim(-1, 0).reshape(log_prob.shape)
-
-
-@value_set.register
-def _(density: PredictionSet) -> PredictionSet:
-    return density
-
-
-@outlier_score.register
-def _(density: PredictionSet) -> Float[Tensor, "*batch"] | None:
-    return outlier_score(density.density)
 
 
 @marginal.register
