@@ -257,10 +257,10 @@ class FrozenFrontEnd(Predictor):
 def one_pass(predictor: Predictor, caches: Sequence[SharedResult[Any]] | None = None) -> Iterator[None]:
     """Compute shared results only once for each tensor of inputs inside the block.
 
-    Loss and densities of the same inputs then reuse them. The shared results are fixed features (`Encoder.fixed`), the
-    raw parameters of direct heads (`DensityHead.direct`), and the results that other modules keep in an attribute
-    `shared_result`. Raw parameters of direct heads are shared, because they are images that are expensive to compute,
-    and an objective reads the same images as the loss.
+    Loss and densities of the same inputs then reuse them. The shared results are features without trained parameters
+    (`Encoder.fixed`), the raw parameters of heads that read the features themselves (`DensityHead.direct`), and the
+    results that other modules keep in an attribute `shared_result`. Raw parameters of a direct head are shared, because
+    they are images that are expensive to compute, and an objective reads the same images as the loss.
 
     Args:
         predictor: the predictor.

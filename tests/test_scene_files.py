@@ -572,7 +572,7 @@ def test_the_total_size_of_textures_is_limited(tmp_path: Path, monkeypatch: pyte
             lambda whole: whole["accessors"][0].update(count=3),
             "refers to vertex 3, but the vertices are numbered 0 to 2",
         ),
-        (lambda whole: whole["accessors"][0].pop("count"), "lacks the key 'count'"),
+        (lambda whole: whole["accessors"][0].pop("count"), "the key 'count' is missing"),
         (lambda whole: whole["bufferViews"][0].update(byteLength=10**9), "the file is cut short"),
         (
             lambda whole: whole["textures"][0].update(source=-1),

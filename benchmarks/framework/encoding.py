@@ -200,8 +200,9 @@ def page(results: dict[str, Any]) -> str:
             "",
             "The last column is the rate of the row, divided by the rate of the encoder alone on the same number "
             f"of cores (for {CORES} cores: {CORES} × its rate on one core). Processes that run at once share the "
-            f"memory of the machine, which slows them down: the rate of the {CORES} jobs is "
-            f"{median_and_range(ratio_together, 2)} times the rate of {CORES} processes of the encoder at once.",
+            f"memory of the machine, which can slow them down. This holds for {CORES} processes of the encoder as well "
+            f"as for {CORES} jobs: the rate of the jobs is {median_and_range(ratio_together, 2)} times the rate of "
+            f"{CORES} processes of the encoder at once.",
             "",
             f"Before and after the encoding, the command takes {median_and_range(beyond, 2)} s (imports, "
             "composition of the config, end of the sweep). This is about as long as the encoding of the "

@@ -1,10 +1,10 @@
-"""Files of body models: the published layout (`v_template`, `shapedirs` …) in .npz or .pkl, and a layout of our own.
+"""Files of body models: the layout of SMPL's published files, .npz or .pkl, and a layout of our own.
 
-The published models with linear blend skinning use this layout, for V vertices, J joints, F faces and B shape
-coefficients: `v_template` (V, 3), `shapedirs` (V, 3, B), `J_regressor` (J, V), `weights` (V, J), `kintree_table` (2, J)
-whose first row holds parents, `f` (F, 3), and in most files `posedirs` (V, 3, number of pose features) with 9 (J - 1)
-or 4 (J - 1) + 1 pose features. Other keys are not read. Pickles are read by framework.bodies.restricted_pickle, which
-calls no function that a file names.
+SMPL and later models with linear blend skinning are published in this layout, for V vertices, J joints, F faces and B
+shape coefficients: `v_template` (V, 3), `shapedirs` (V, 3, B), `J_regressor` (J, V), `weights` (V, J), `kintree_table`
+(2, J) whose first row holds parents, `f` (F, 3), and in most files `posedirs` (V, 3, number of pose features). The
+number of pose features is 9 (J - 1) or 4 (J - 1) + 1. Other keys are not read. Pickles are read by
+framework.bodies.restricted_pickle, which calls no function that a file names.
 """
 
 import math
@@ -29,7 +29,7 @@ WANTED = f"Give a file with the arrays {', '.join(NEEDED)}, and posedirs if the 
 
 
 def read(file: Path) -> Body:
-    """Read a body model from a file in the published layout.
+    """Read a body model from an .npz or .pkl file in the layout of SMPL's published files (`v_template`, …).
 
     Raises:
         DataError: the file does not exist, has another format, holds something other than arrays and plain values, or

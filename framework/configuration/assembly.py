@@ -88,8 +88,8 @@ def assemble(settings: Settings) -> Assembly:
         chosen = getattr(settings, group) or {}
         if not isinstance(chosen, Mapping):
             raise ConfigError(
-                f"{group} = {quote(chosen)}: expected a mapping from names of your choice to one {group} each. "
-                f"Write {group}=[<name>], or {group}.<key>.name=<name>."
+                f"{group} = {quote(chosen)}: expected a list of plugins, or a mapping with one plugin for each key. "
+                f"Write {group}=[<plugin>], or {group}.<key>.name=<plugin> with a key of your choice."
             )
         resolved[group] = [resolve(group, part, f"{group}.{key}") for key, part in chosen.items()]
     resolved["outliers"] = resolve("data", settings.outliers, "outliers") if settings.outliers else None

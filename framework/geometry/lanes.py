@@ -126,13 +126,19 @@ register(operator.ne, comparison("!="), compares=True)
 
 @no_type_check
 def least_of(builder, element, x, y):
-    """Emit code that computes the smaller number of x and y in each lane; y if x is NaN (a `Make`)."""
+    """Emit LLVM code for the smaller number of x and y in each lane, and return its result; y where x is NaN.
+
+    The arguments and the result are those of a `Make`, a function that emits the code of an operation.
+    """
     return builder.select(comparison("<")(builder, element, x, y), x, y)
 
 
 @no_type_check
 def most_of(builder, element, x, y):
-    """Emit code that computes the larger number of x and y in each lane; y if x is NaN (a `Make`)."""
+    """Emit LLVM code for the larger number of x and y in each lane, and return its result; y where x is NaN.
+
+    The arguments and the result are those of a `Make`, a function that emits the code of an operation.
+    """
     return builder.select(comparison(">")(builder, element, x, y), x, y)
 
 

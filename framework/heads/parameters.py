@@ -78,7 +78,7 @@ def require_trained(component: DensityHead) -> DensityHead:
     if fitted:
         raise ConfigError(
             f"density_head.component fits {', '.join(sorted(fitted))} after training, but only the head "
-            "of a model can be fitted then. Let the component predict these parameters, for example with "
-            "concentration=predicted."
+            "of a model can be fitted then. Let the component predict these parameters, as von_mises does with "
+            "density_head.component.concentration=predicted."
         )
     return component

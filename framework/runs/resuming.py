@@ -36,7 +36,10 @@ if TYPE_CHECKING:
     from framework.runs.run import Run
 
 HOW = ("threads", "workers", "logger.uri")
-"""Keys that do not affect the result of a run, so that a resumed run may have other values of them."""
+"""Keys that do not affect the result of a run, except that `threads` may change the last digits.
+
+A resumed run may have other values of them.
+"""
 PROCESSES = ("trainer.devices", "trainer.num_nodes", "trainer.strategy")
 """Keys that say how many processes train.
 

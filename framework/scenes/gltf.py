@@ -75,8 +75,8 @@ def read(file: Path) -> Subject:
             parts = list(_read_parts(document, parents))
         except KeyError as error:
             raise ValueError(
-                f"the description of the glTF file lacks the key {shorten(error)}, or uses this value where it is "
-                "not allowed"
+                f"in the description of the glTF file, the key {shorten(error)} is missing, or the value "
+                f"{shorten(error)} is not allowed"
             ) from error
         return join_parts(parts, "y", document.notes)
 

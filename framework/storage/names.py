@@ -35,9 +35,10 @@ def path_of(spelling: str) -> Path:
 
 
 def is_within(name: str) -> bool:
-    """Return whether a path that a list or table names stays in the folder of the data, to which it is joined.
+    """Return whether a path from a list or table stays in the data folder: it is relative and has no part "..".
 
-    A list from another person could otherwise name private images, which the figures of a run would show.
+    Callers refuse other paths, because a list from another person could name private images, which the figures of a
+    run would show.
     """
     return not name.startswith("/") and ".." not in name.split("/")
 

@@ -36,7 +36,8 @@ def cells(density: Distribution) -> tuple[list[Tensor], Tensor]:
     numbers = density.event_shape[0]
     if numbers not in CELLS:
         raise ValueError(
-            f"Got a density of {numbers} numbers, but the cells cover one to three. Pass a marginal density."
+            f"Got a density of {numbers} numbers, but only the domains of one to three numbers are divided into cells. "
+            "Pass a marginal density."
         )
     if numbers == 3 and isinstance(density.support, Circular):
         return cells_of_three_angles(density, CELLS[numbers])

@@ -1,4 +1,4 @@
-"""Batches of a data set, whose order is a function of (seed, epoch)."""
+"""Batches of a data set, in an order that depends only on the seed, the epoch and the model."""
 
 import os
 import signal
@@ -33,8 +33,9 @@ Position = tuple[int, int]
 class SeededBatches(Sampler[list[int]]):
     """Sampler that yields the indices of the samples of each batch; with several ranks, those of this rank's slice.
 
-    The order of the samples depends on (seed, epoch) only, not on the ranks. Rank r of R takes the r-th of R nearly
-    equal slices of each batch. So all ranks have equally many batches, and no sample occurs twice.
+    The order of the samples depends on the seed, the epoch and the model (if several models train together, each has
+    its own order), but not on the ranks. Rank r of R takes the r-th of R nearly equal slices of each batch. So all
+    ranks have equally many batches, and no sample occurs twice.
 
     Args:
         length: number of samples.
@@ -94,7 +95,7 @@ class SeededBatches(Sampler[list[int]]):
 
 
 def epoch_order(length: int, seed: int | None, epoch: int, member: int = 0) -> list[int]:
-    """Return the order of `length` samples in an epoch: a permutation that depends on (seed, epoch) only.
+    """Return the order of `length` samples in an epoch: a permutation that depends on (seed, epoch, member) only.
 
     Args:
         length: number of samples.

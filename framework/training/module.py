@@ -495,7 +495,7 @@ class StopEarly(BatchCallback, EarlyStopping):
 
 
 class StopIfPruned(BatchCallback):
-    """Callback that stops a training at the end of a validation if a file exists.
+    """Callback that stops a training at the end of a validation if a search has asked for it by a file.
 
     Args:
         path: File with which a search asks the run to stop.
@@ -509,7 +509,7 @@ class StopIfPruned(BatchCallback):
         self.pruned = False
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Stop the training in all ranks if any of them finds the file."""
+        """Stop the training in all ranks if any rank finds the file `path`, with which a search asks for it."""
         if not trainer.sanity_checking and trainer.state.fn == "fit":
             self.pruned = trainer.strategy.reduce_boolean_decision(self.path.is_file(), all=False)
             trainer.should_stop = trainer.should_stop or self.pruned

@@ -36,7 +36,11 @@ from framework.storage.threads import POOL
 
 Array = NDArray[np.floating]
 FINE, BAD_CLOUD, BAD_QUERIES, IMMODERATE = 0, 1, 2, 3
-"""Outcomes for a cloud: it was searched; it is not finite; its queries are not finite; it must be scaled first."""
+"""Outcomes of the search in a cloud.
+
+FINE: the nearest points were found. BAD_CLOUD: a point is not finite. BAD_QUERIES: a query is not finite. IMMODERATE:
+the coordinates are so large or so small that the cloud and its queries must be scaled before a search.
+"""
 QUERY_COUNT = 17
 """Index in `levels` of packed queries at which their number is stored."""
 LARGE = 2**15
@@ -309,9 +313,12 @@ class Results(NamedTuple):
     """Result of the search in a batch of clouds.
 
     Attributes:
-        distance: distance of the nearest point, (batch, queries); NaN for queries that do not exist.
-        index: row of this point in the cloud, (batch, queries); 0 for queries that do not exist.
-        outcome: FINE, BAD_CLOUD, BAD_QUERIES or IMMODERATE for each cloud, (batch,).
+        distance: distance from each query to the nearest point of its cloud, (batch, queries); NaN after the last
+            query of a cloud, if the clouds have different numbers of queries.
+        index: row of this point in the cloud, (batch, queries); 0 where `distance` is NaN.
+        outcome: for each cloud, (batch,), FINE if it was searched; otherwise the reason why it was not: BAD_CLOUD (a
+            point is not finite), BAD_QUERIES (a query is not finite) or IMMODERATE (coordinates are so large or so
+            small that they must be scaled before a search). Distances and indices of this cloud are then undefined.
     """
 
     distance: Array

@@ -118,7 +118,7 @@ class Middle:
         self.first = self.sum = torch.zeros(3, dtype=torch.float64)
 
     def add(self, chunk: Float[Tensor, "points columns"]) -> None:
-        """Include the points of a chunk in the mean."""
+        """Update the mean with the points of a chunk."""
         points = finite_points(chunk)
         if len(points) == 0:
             return
@@ -148,7 +148,7 @@ class Reach:
         self.largest = 0.0
 
     def add(self, chunk: Float[Tensor, "points columns"]) -> None:
-        """Include the points of a chunk in the largest distance."""
+        """Update the largest distance from the centre with the points of a chunk."""
         points = finite_points(chunk)
         if len(points):
             self.largest = max(

@@ -66,7 +66,7 @@ def _label(file: Path, position: str, entry: Any) -> Label:
 
 
 def write_labels(file: Path, labels: Mapping[str, Sequence[Label]], side: int) -> None:
-    """Write a label file in the published layout; the same labels give the same bytes.
+    """Write a label file in the layout of the published `or_label.mat`; the same labels give the same bytes.
 
     The fields x, y and size of each label describe a head that fills an image of `side` × `side` pixels.
     """

@@ -160,7 +160,7 @@ def describe_unread(listed: FileList, reading: Reading) -> tuple[str, ...]:
 
 
 def split_clouds(cloud_set: CloudSet) -> dict[str, Clouds]:
-    """Return the clouds of each split, with "target", "group" (one for all) and the further fields of each cloud.
+    """Return the clouds of each split, with "target", "group" (the same for all clouds) and the further fields.
 
     Raises:
         DataError: A split is empty.

@@ -19,7 +19,7 @@ class Moons(PlanePoints):
 
     Args:
         draws: Sizes and seed of the splits.
-        noise: Standard deviation of the noise on either coordinate, in radii of the half circles.
+        noise: Standard deviation of the noise on either coordinate, in units of the half circles' radius.
     """
 
     bibtex = "pedregosa2011scikit"

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from scipy.special import log_expit
 
 CENTRE = np.array([0.5, 0.25])
-"""Mean of the distribution and centre of its symmetry, in radii of the arcs."""
+"""Mean of the distribution and centre of its symmetry, in units of the arcs' radius."""
 NODES = 64
 """Number of nodes of the Gauss-Legendre rule on each piece of an arc."""
 DECAY = 40.0
@@ -22,7 +22,7 @@ DECAY = 40.0
 
 
 def scale(noise: float) -> np.ndarray:
-    """Return the standard deviations of x and of y over both classes, (2,), in radii of the arcs.
+    """Return the standard deviations of x and of y over both classes, (2,), in units of the arcs' radius.
 
     With coordinates relative to the centre of symmetry, a uniform angle θ and σ = `noise`, E x² = ½ + ¼ + σ² and
     E y² = E (sin θ - ¼)² + σ² = ½ - 1/π + 1/16 + σ², because E sin θ = 2/π.
@@ -31,13 +31,14 @@ def scale(noise: float) -> np.ndarray:
 
 
 def draw(size: int, noise: float, *key: int) -> tuple[Float[np.ndarray, "size 2"], Int[np.ndarray, "size"]]:
-    """Return random points in standard units, and their classes, which alternate.
+    """Return random points, scaled to mean 0 and standard deviation 1, and their classes, which alternate.
 
-    With the same key, a larger draw begins with the points of a smaller draw.
+    The mean and the standard deviation are those of the distribution, not of the returned points. With the same
+    key, a larger draw begins with the points of a smaller draw.
 
     Args:
         size: Number of points.
-        noise: Standard deviation of the noise, in radii.
+        noise: Standard deviation of the noise before the scaling, in units of the arcs' radius.
         key: Numbers that choose the random stream; other numbers give independent points.
     """
     angles, normals = (np.random.default_rng([*key, part]) for part in range(2))
@@ -49,9 +50,11 @@ def draw(size: int, noise: float, *key: int) -> tuple[Float[np.ndarray, "size 2"
 
 
 def log_density(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[np.ndarray, "*batch 2"]:
-    """Return log p(x | y) for y = 0 and 1, nats, of points in standard units; finite for every finite float32.
+    """Return log p(x | y) for y = 0 and 1, nats; it is finite for every finite float32.
 
-    `noise` is the standard deviation of the noise, in radii.
+    Args:
+        points: Points x, scaled so that the distribution of both classes has mean 0 and standard deviation 1.
+        noise: Standard deviation of the noise before the scaling, in units of the arcs' radius.
     """
     distance, log_integral = _polar_terms(points, noise)
     # |x - (cos θ, sin θ)|² = (d - 1)² + 4 d sin²(t/2), where d is x's distance from the circle's centre and t the
@@ -62,9 +65,11 @@ def log_density(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[np
 
 
 def log_posterior(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[np.ndarray, "*batch 2"]:
-    """Return log p(y | x) for y = 0 and 1, with equal prior probabilities, of points in standard units.
+    """Return log p(y | x) for the classes y = 0 and 1, which have equal prior probabilities.
 
-    `noise` is the standard deviation of the noise, in radii.
+    Args:
+        points: Points x, scaled so that the distribution of both classes has mean 0 and standard deviation 1.
+        noise: Standard deviation of the noise before the scaling, in units of the arcs' radius.
     """
     distance, log_integral = _polar_terms(points, noise)
     total = distance.sum(-1)
@@ -76,9 +81,11 @@ def log_posterior(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[
 
 
 def posterior(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[np.ndarray, "*batch 2"]:
-    """Return p(y | x) for y = 0 and 1, of points x in standard units; no prediction of the class y can be better.
+    """Return p(y | x) for the classes y = 0 and 1; no prediction of y has a better expected log-likelihood.
 
-    `noise` is the standard deviation of the noise, in radii.
+    Args:
+        points: Points x, scaled so that the distribution of both classes has mean 0 and standard deviation 1.
+        noise: Standard deviation of the noise before the scaling, in units of the arcs' radius.
     """
     return np.exp(log_posterior(points, noise))
 
@@ -89,9 +96,10 @@ def _polar_terms(
     """Return, for each class, the distance d of a point x from the circle's centre, and the logarithm of an integral.
 
     The integral is ∫ exp(-2 d sin²(t/2) / σ²) dt over the arc of the class, where t is the angle at the circle's centre
-    between x and a point of the arc, and σ is `noise`. Lengths are in radii of the arcs. The integrand falls with |t|.
-    The arc is divided into two pieces on each of which |t| is monotonic. If the arc contains the direction of x, both
-    pieces start there, at |t| = 0. Otherwise each piece starts at an end of the arc and ends opposite to x, at |t| = π.
+    between x and a point of the arc, and σ is `noise`. Lengths are in units of the arcs' radius. The integrand falls
+    with |t|. The arc is divided into two pieces on each of which |t| is monotonic. If the arc contains the direction of
+    x, both pieces start there, at |t| = 0. Otherwise each piece starts at an end of the arc and ends opposite to x, at
+    |t| = π.
     """
     centred = points * scale(noise)
     from_centres = np.stack([centred + CENTRE, CENTRE - centred], -2)

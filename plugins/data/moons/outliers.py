@@ -20,8 +20,8 @@ class MoonsOutliers(PlanePoints):
     The training data of `moons` hold no points there, but networks trained on them are nevertheless certain (the
     triangles of thesis Figure 2.2; §2.3.1).
 
-    Points are uniformly distributed on the discs, in the standard units of `moons`. The target of a point is the class
-    of the nearer moon; it has no meaning. The splits are independent draws.
+    Points are uniformly distributed on the discs, in the scaled coordinates of the inputs of `moons`. The target of a
+    point is the class of the nearer moon; it has no meaning. The splits are independent draws.
 
     Args:
         draws: Sizes and seed of the splits; the points lie alternately on the two discs.

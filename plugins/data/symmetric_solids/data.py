@@ -100,8 +100,8 @@ class SymmetricSolids(Data):
             )
         if 0 < label_noise_deg < 0.1:
             raise ConfigError(
-                f"data.label_noise_deg = {label_noise_deg:g} is below 0.1, the accuracy with which images of "
-                "at most 224 pixels could be read. Give 0 for exact labels, or 0.1 or more."
+                f"data.label_noise_deg = {label_noise_deg:g} is above 0 but below 0.1. Images of at most 224 pixels "
+                "are too coarse to read rotations so exactly. Give 0 for exact labels, or at least 0.1 degrees."
             )
         self.groups = tuple(solids)
         self.counts = asdict(counts)

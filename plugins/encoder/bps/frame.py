@@ -49,7 +49,11 @@ def frame(coordinates: Float[Tensor, "batch points 3"], reach: float = 1.0) -> F
         reach: norm beyond which points are outliers, which do not influence the axes.
     """
     if torch.compiler.is_exporting():
-        raise ConfigError("The axes of a cloud are eigenvectors, for which ONNX has no operation.")
+        raise ConfigError(
+            "The encoder bps with rotation_invariant=true cannot be exported, because the axes of a cloud are "
+            "eigenvectors, for which ONNX has no operation. For an export, train a model with "
+            "encoder.bps.rotation_invariant=false."
+        )
     points = coordinates.double()
     norm = torch.linalg.vector_norm(points.detach(), dim=-1, keepdim=True)
     inside = norm <= LARGEST_NORM * reach  # False for NaN

@@ -34,7 +34,10 @@ def nearest_rows(
         ConfigError: the network is exported.
     """
     if torch.compiler.is_exporting():
-        raise ConfigError("The search for nearest neighbours depends on the number of points of each cloud.")
+        raise ConfigError(
+            "The search for nearest neighbours cannot be exported, because it depends on the number of points of each "
+            "cloud. For an export, train a model with another encoder."
+        )
     numbers = counts.tolist()
     most = min(neighbours, max(numbers, default=1))
     indices, start = [counts.new_zeros(0, most)], 0

@@ -115,6 +115,8 @@ def project(
 def pyramid(cloud: np.ndarray, view: CameraView) -> list[np.ndarray]:
     """Return for each level the index of the point that each pixel shows, or -1 for pixels that show no point.
 
+    Level 0 is the full image; each further level has half the size of the previous one, rounded up.
+
     `cloud` is (points, columns); the first columns are x, y, z in the camera's coordinates, metres.
     """
     depth, index = np.empty(view.size(0), np.float32), np.empty(view.size(0), np.int32)
@@ -131,7 +133,11 @@ def pyramid(cloud: np.ndarray, view: CameraView) -> list[np.ndarray]:
 def visible_points(
     clouds: Float[Tensor, "batch points columns"], view: CameraView
 ) -> list[Int[Tensor, "batch _rows _columns"]]:
-    """Return for each level the indices that `pyramid` returns, (batch, rows, columns), for contiguous CPU tensors."""
+    """Return for each level the index of the point that each pixel shows, or -1 for pixels that show no point.
+
+    Level 0 is the full image; each further level has half the size of the previous one, rounded up. The indices of a
+    level are (batch, rows, columns), and count the points of a cloud. `clouds` is a contiguous tensor on the CPU.
+    """
     arrays = clouds.numpy()
     pyramids = [pyramid(array, view) for array in arrays]
     return [

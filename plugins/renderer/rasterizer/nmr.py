@@ -62,12 +62,19 @@ def add_edge_gradients(
 def collect_gradient_pixels(face, color, grad_image):
     """Return the pixels at which the gradient of the loss with respect to the colour is not 0, line by line.
 
-    These are the stored pixels. I is the colour of a pixel, and g is the gradient of the loss with respect to this
-    colour.
+    These are the stored pixels. A line is a row of the image, or a column if the arrays are transposed. I is the colour
+    of a pixel, and g is the gradient of the loss with respect to this colour.
+
+    Args:
+        face: (lines, length), index of the face that each pixel shows; -1 for none.
+        color: (lines, length, channels), I.
+        grad_image: (lines, length, channels), g.
 
     Returns:
-        before: (lines, length + 1), number of stored pixels before each pixel.
-        pixel_positions, owner, value: for each stored pixel its position, the face that it shows, and I · g.
+        before: (lines, length + 1), number of stored pixels before each pixel and before the end of each line, counted
+            from the first pixel of the first line.
+        pixel_positions, owner, value: for each stored pixel its position in its line, the face that it shows, and
+            I · g, the sum over the channels.
         slopes: (channels, stored pixels), g.
     """
     lines, length = face.shape

@@ -65,7 +65,7 @@ class Together(nn.Module):
         self.chain.forget_masks()
 
     def densities(self, inputs: Tensor) -> list[Distribution]:
-        """Return the densities of the models of each group, batch_shape (batch, K)."""
+        """Return one distribution for each group: the densities of its K models, batch_shape (batch, K)."""
         return [self._head(group)(raw) for group, raw in enumerate(self._raw(inputs))]
 
     def training_densities(self, inputs: Tensor) -> list[Distribution]:
@@ -101,7 +101,7 @@ class Together(nn.Module):
             self._head(group).calibrate(torch.cat(parts), torch.cat(targets))
 
     def _raw(self, inputs: Tensor) -> Sequence[Float[Tensor, "batch member size"]]:
-        """Return the raw parameters of the models of each group."""
+        """Return one tensor for each group: the raw parameters of its K models."""
         return self.chain(inputs.flatten(1)).movedim(0, 1).chunk(len(self.heads), 1)
 
     def _head(self, group: int) -> DensityHead:
@@ -161,7 +161,7 @@ class Apart(nn.Module):
             best.clear()
 
     def densities(self, inputs: Tensor) -> list[Distribution]:
-        """Return the densities of the models of each group, batch_shape (batch, K)."""
+        """Return one distribution for each group: the densities of its K models, batch_shape (batch, K)."""
         several = [model(inputs) for model in self._all()]
         return [Stacked(several[first : first + self.size]) for first in range(0, len(several), self.size)]
 

@@ -53,7 +53,7 @@ def test_a_table_is_learned_with_two_settings(table, task, target):
     least = -2.3 if task == "regression" else -0.35  # a constant density has -3.8 and -0.69
     assert results["log_likelihood"] > least
     assert 0.75 < results["set_coverage"] <= 1
-    if task == "regression":  # the intervals of the figure are the promised sets
+    if task == "regression":  # the intervals of the figure are the conformal prediction sets
         drawn = (folder / "figures" / "predicted_intervals.svg").read_text()
         assert f"{45 * results['set_coverage']:.0f} of 45 true values are inside" in drawn
         assert "stated: 90 %" in drawn

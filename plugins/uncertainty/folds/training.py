@@ -30,7 +30,7 @@ class Schedule:
     Attributes:
         steps, epochs: smallest number of steps, and smallest number of passes over the samples.
         learning_rate: largest learning rate of AdamW.
-        weight_decay: decay of the weights in each group; biases do not decay.
+        weight_decay: weight decay for each group of models (see `Folds`); biases do not decay.
         batch_size: samples of a batch of each model.
         most_steps: largest number of steps, even if `steps` and `epochs` ask for more.
     """

@@ -52,7 +52,7 @@ class Folds(Uncertainty, SelfTraining):
     Args:
         folds: K, the number of folds.
         dropout: probability of all dropout layers in each group; null keeps the probabilities of the encoder.
-        weight_decay: weight decay in each group.
+        weight_decay: weight decay for each group of models.
         learning_rate: largest learning rate.
         steps, epochs: smallest number of steps, and smallest number of passes over its samples, for which each group
             trains.
@@ -141,7 +141,7 @@ class Folds(Uncertainty, SelfTraining):
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
         """Return the mean loss of all models for each sample, nats.
 
-        Its gradient trains each model as the model would train alone.
+        The gradient is that of the sum over the models instead of their mean, so each model trains as it would alone.
         """
         return independent_penalty(self.models.losses_of_all(inputs, target))
 
