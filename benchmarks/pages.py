@@ -4,7 +4,7 @@ import datetime
 import platform
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -51,6 +51,14 @@ def publish(script: str | Path, text: str, name: str = "") -> None:
     """Write the page of a script (see `write_page`), and print its text."""
     write_page(script, text, name)
     sys.stdout.write(text)
+
+
+def run_or_draw(run: Callable[[], object], draw: Callable[[], object]) -> None:
+    """Run a script, or only draw its figures again if the argument of the script is `--draw`."""
+    if sys.argv[1:] == ["--draw"]:
+        draw()
+    else:
+        run()
 
 
 def replace_section(page: Path, heading: str, text: str) -> None:

@@ -54,12 +54,6 @@ class _OfReals(DensityHead):
         place, scale, _ = self.unit.to_target_unit(place, scale)
         return place, scale
 
-    def loss(self, raw: Tensor, target: Tensor) -> Tensor:
-        return -self(raw).log_prob(target)
-
-    def calibrate(self, raw: Tensor, target: Tensor) -> None:
-        pass
-
 
 class Product(Distribution):
     """Product of independent one-dimensional torch densities.
@@ -143,12 +137,6 @@ class LearnedTHead(DensityHead):
         place, scale = place.clamp(-LARGEST, LARGEST), scale.clamp(-SCALES, SCALES).exp()
         return Product(StudentT, 1 + 30 * torch.sigmoid(freedom), place, scale)
 
-    def loss(self, raw: Tensor, target: Tensor) -> Tensor:
-        return -self(raw).log_prob(target)
-
-    def calibrate(self, raw: Tensor, target: Tensor) -> None:
-        pass
-
 
 class LaplaceHead(_OfReals):
     """Laplace densities of torch."""
@@ -165,6 +153,10 @@ class _Located(Distribution):
     def __init__(self, place: Tensor, scale: Tensor) -> None:
         self.place, self.width = place, scale
         super().__init__(place.shape[:-1], place.shape[-1:], validate_args=False)
+
+    @property
+    def mean(self) -> Tensor:
+        return self.place
 
     @property
     def mode(self) -> Tensor:
@@ -192,10 +184,6 @@ class Logistic(_Located):
     @property
     def support(self) -> constraints.Constraint:
         return constraints.real_vector
-
-    @property
-    def mean(self) -> Tensor:
-        return self.place
 
     @property
     def variance(self) -> Tensor:
@@ -313,12 +301,6 @@ class WrappedNormalHead(DensityHead):
         # the bounds keep squares in the gradient of atan2 from overflow and underflow
         place = torch.atan2(sin.clamp(-1e18, 1e18), cos.clamp(-1e18, 1e18) + 1e-12)
         return WrappedNormal(place, 1e-3 + 1.9 * torch.sigmoid(width))
-
-    def loss(self, raw: Tensor, target: Tensor) -> Tensor:
-        return -self(raw).log_prob(target)
-
-    def calibrate(self, raw: Tensor, target: Tensor) -> None:
-        pass
 
 
 HEADS: Mapping[str, tuple[type[DensityHead], tuple[Target, ...]]] = {

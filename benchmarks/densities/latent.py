@@ -8,7 +8,6 @@ Writes latent.md, latent.csv and latent.png into the folder of this file and tak
 """
 
 import math
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,7 +21,7 @@ from matplotlib.lines import Line2D
 from torch import Tensor, nn
 
 from benchmarks.densities.latent_points import sequences
-from benchmarks.pages import machine, publish, read_rows
+from benchmarks.pages import machine, publish, read_rows, run_or_draw
 from framework.configuration.schema import build, resolve
 from framework.density_head import DensityHead
 from framework.distributions.protocol import estimate
@@ -383,7 +382,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["--draw"]:
-        draw_figure(read_rows(HERE.with_suffix(".csv")))
-    else:
-        main()
+    run_or_draw(main, lambda: draw_figure(read_rows(HERE.with_suffix(".csv"))))

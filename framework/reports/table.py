@@ -114,10 +114,9 @@ def html(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | No
     If any result is synthetic, a column says which ones are.
 
     Args:
-        rows: the results, one per row.
-        columns: headings by key, in order; the first column names the result.
-        better: "higher" or "lower", whichever is better, for the key of each column in which the best number may be
-            bold; None: no number is bold, and no heading has an arrow.
+        rows: the results, as in `markdown`.
+        columns: headings by key, as in `markdown`.
+        better: better directions, as in `markdown`; None: no number is bold, and no heading has an arrow.
     """
     lines = _lines(rows, columns, better or {}, origin=any(map(_synthetic, rows)))
     _add_arrows(lines[0], columns, better)
@@ -138,13 +137,7 @@ def html(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | No
 def latex(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | None = None) -> str:
     """Return a table of the results in LaTeX; the table needs no LaTeX package.
 
-    If any result is synthetic, a column says which ones are.
-
-    Args:
-        rows: the results, one per row.
-        columns: headings by key, in order; the first column names the result.
-        better: "higher" or "lower", whichever is better, for the key of each column in which the best number may be
-            bold; None: no number is bold.
+    The arguments are those of `markdown`. If any result is synthetic, a column says which ones are.
     """
     lines = _lines(rows, columns, better or {}, origin=any(map(_synthetic, rows)))
     head, *body = (" & ".join(_latex_cell(cell) for cell in line) + r" \\" for line in lines)

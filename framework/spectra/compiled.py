@@ -110,17 +110,9 @@ def compute_sums(parameters, rows, measured, offsets, centres, cost, gradient, g
 @compiled
 @no_type_check
 def compute_curvature(parameters, rows, measured, offsets, centres, curvature):
-    """Fill `curvature` with the sum over the offsets of the residual times ∇²Z.
+    """Fill `curvature`, (spectrum, p, p), with the sum over the offsets of the residual times ∇²Z.
 
-    ∇²Z is the matrix of second derivatives of Z by the parameters.
-
-    Args:
-        parameters: parameters of the spectra, (spectrum, p).
-        rows: row of each spectrum in `measured`, (spectrum,).
-        measured: measured Z, (row, offset), NaN where nothing was measured.
-        offsets: offsets, (offset,), ppm.
-        centres: centres of the pools, (pool,), ppm from water.
-        curvature: filled with the sums, (spectrum, p, p).
+    ∇²Z is the matrix of second derivatives of Z by the parameters. The other arguments are those of `compute_sums`.
     """
     pools, size, count = centres.shape[0], parameters.shape[1], offsets.shape[0]
     shift = 2 * pools

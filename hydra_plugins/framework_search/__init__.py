@@ -178,10 +178,7 @@ class RandomSearch(Search):
     Args:
         trials: number of different trials; if the search space has fewer points, every point is run once.
         seed: seed of the draws.
-        metric: key of results.json by which trials are ranked; None: the value that a job returns, its best validation
-            loss in nats. A list of two keys asks for the Pareto front.
-        direction: "minimize" or "maximize", for each metric; None: the direction that the metric declares.
-        params: sweeps by key, in Hydra's grammar; a sweep of the same key on the command line takes precedence.
+        metric, direction, params: as in `Search`.
     """
 
     def __init__(

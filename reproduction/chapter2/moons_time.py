@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 
 import framework
-from benchmarks.pages import environment, read_rows
+from benchmarks.pages import environment, read_rows, run_or_draw
 from framework.configuration.schema import build, resolve
 from framework.datasets.fields import as_batch
 from framework.evaluation.tradeoff import rows, tradeoff
@@ -86,7 +86,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["--draw"]:
-        draw_figure(read_rows(HERE / "moons_time.csv"))
-    else:
-        main()
+    run_or_draw(main, lambda: draw_figure(read_rows(HERE / "moons_time.csv")))

@@ -25,7 +25,7 @@ import torch
 
 import framework
 from benchmarks.commands import ROOT, carry_out
-from benchmarks.pages import machine, read_rows, write_page
+from benchmarks.pages import machine, read_rows, run_or_draw, write_page
 from framework.configuration.schema import build, resolve
 from framework.data import Data
 from framework.distributions.protocol import median
@@ -431,7 +431,7 @@ def error_ratios(results: dict[str, list[FlightErrors]], method: str) -> str:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["--draw"]:
-        draw_errors(read_rows(HERE.with_suffix(".csv")))
-    else:
-        main(sys.argv[1] if len(sys.argv) > 1 else None)
+    run_or_draw(
+        lambda: main(sys.argv[1] if len(sys.argv) > 1 else None),
+        lambda: draw_errors(read_rows(HERE.with_suffix(".csv"))),
+    )

@@ -13,7 +13,6 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import math
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from time import process_time
@@ -25,7 +24,7 @@ from sklearn.neighbors import NearestNeighbors
 from torch import Tensor
 
 from benchmarks.clouds.shapes import shapes
-from benchmarks.pages import machine, publish, read_rows
+from benchmarks.pages import machine, publish, read_rows, run_or_draw
 from framework.figures.style import COLOURS, MARKERS, save_figure, titled_figure
 from framework.geometry.clouds import NormalisedClouds, sizes
 from framework.geometry.nearest import chamfer
@@ -298,7 +297,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["--draw"]:
-        draw_figures(*(read_rows(HERE.with_name(f"reconstruction{part}.csv")) for part in ("", "_time")))
-    else:
-        main()
+    tables = [HERE.with_name(f"reconstruction{part}.csv") for part in ("", "_time")]
+    run_or_draw(main, lambda: draw_figures(*map(read_rows, tables)))

@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.pages import machine, read_rows, write_page
+from benchmarks.pages import machine, read_rows, run_or_draw, write_page
 from framework.configuration.assembly import build_predictor
 from framework.configuration.description import Description
 from framework.configuration.loading import read_stored, rebuild
@@ -202,7 +202,4 @@ def describe_run(run: str) -> str:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["--draw"]:
-        draw_figure(read_rows(HERE.with_suffix(".csv")))
-    else:
-        main(sys.argv[1:])
+    run_or_draw(lambda: main(sys.argv[1:]), lambda: draw_figure(read_rows(HERE.with_suffix(".csv"))))

@@ -204,14 +204,8 @@ def search_share(packed, packets, counter, step, distance, index):
 def search_all_share(cloud, size, packets, counter, step, distance, index):
     """Find the nearest points to a part of the packets in one thread, in a cloud that is not packed.
 
-    Args:
-        cloud: coordinates of the points, x y z x y z …, (3 · points,).
-        size: number of points.
-        packets: packed queries; a packet holds sixteen neighbouring queries.
-        counter: index of the next packet, (1,) int64, which all threads share and increase.
-        step: number of packets that a thread takes at a time.
-        distance: filled with the distance of the nearest point to each query, at the row of the query.
-        index: filled with the row of this point in the cloud, at the row of the query.
+    `cloud` holds the coordinates of `size` points as x y z x y z …, (3 · points,). The other arguments are those of
+    `search_share`.
     """
     number = packets.levels[8]
     while True:

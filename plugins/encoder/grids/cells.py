@@ -1,8 +1,10 @@
 """Base class of the encoders on a grid over [-1, 1]³, and the decoding of cells to points."""
 
 from abc import abstractmethod
+from typing import Annotated, ClassVar
 
 from jaxtyping import Bool, Float
+from pydantic import Field
 from torch import Tensor
 
 from framework.encoder import Encoder
@@ -19,25 +21,31 @@ from framework.geometry.clouds import (
     sizes,
 )
 
+Side = Annotated[int, Field(gt=0, le=512)]
+
 
 class CellEncoder(Encoder):
     """Base class of encoders that return one number per cell of a grid of side³ cells over the normalised clouds.
 
     Args:
         input_shape: (points, columns) of the largest cloud.
-        by: name of the encoder, for messages.
         side: number of cells along each edge.
         normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`).
+
+    Attributes:
+        by: name of the encoder, for messages.
 
     Raises:
         ConfigError: the input is not a cloud.
     """
 
     fixed = True
+    by: ClassVar[str]
 
-    def __init__(self, input_shape: tuple[int, ...], by: str, side: int, normalise: Normalisation) -> None:
+    def __init__(
+        self, input_shape: tuple[int, ...], *, side: Side = 32, normalise: Normalisation = "unit_ball"
+    ) -> None:
         super().__init__()
-        self.by = f"encoder {by}"
         require_clouds(input_shape, by=self.by)
         self.side = side
         self.normalise: Normalisation = normalise

@@ -1,12 +1,9 @@
 """Occupancy grids of point clouds, one of the encodings with which the thesis compares basis point sets."""
 
-from typing import Annotated
-
 from jaxtyping import Float
-from pydantic import Field
 from torch import Tensor
 
-from framework.geometry.clouds import Normalisation, NormalisedClouds
+from framework.geometry.clouds import NormalisedClouds
 from plugins.encoder.grids.cells import CellEncoder, chosen_centres
 
 ROUNDING = 1e-6
@@ -30,15 +27,7 @@ class Occupancy(CellEncoder):
     """
 
     bibtex = "maturana2015voxnet"
-
-    def __init__(
-        self,
-        input_shape: tuple[int, ...],
-        *,
-        side: Annotated[int, Field(gt=0, le=512)] = 32,
-        normalise: Normalisation = "unit_ball",
-    ) -> None:
-        super().__init__(input_shape, "occupancy", side, normalise)
+    by = "encoder occupancy"
 
     def encode(self, clouds: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch cells"]:
         """Return the occupancy of the cells."""

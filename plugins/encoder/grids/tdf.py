@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.geometry.clouds import Normalisation, NormalisedClouds
-from plugins.encoder.grids.cells import CellEncoder, chosen_centres
+from plugins.encoder.grids.cells import CellEncoder, Side, chosen_centres
 
 
 class TDF(CellEncoder):
@@ -29,16 +29,17 @@ class TDF(CellEncoder):
     """
 
     bibtex = "curless1996volumetric"
+    by = "encoder tdf"
 
     def __init__(
         self,
         input_shape: tuple[int, ...],
         *,
-        side: Annotated[int, Field(gt=0, le=512)] = 32,
+        side: Side = 32,
         truncation: Annotated[float, Field(gt=0, le=4)] = 1.0,
         normalise: Normalisation = "unit_ball",
     ) -> None:
-        super().__init__(input_shape, "tdf", side, normalise)
+        super().__init__(input_shape, side=side, normalise=normalise)
         self.truncation = truncation
 
     def encode(self, clouds: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch cells"]:
