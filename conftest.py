@@ -5,11 +5,14 @@
 """
 
 import gc
+import inspect
 import os
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ForwardRef, get_args
 
+import jaxtyping
 import pytest
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -25,10 +28,38 @@ for name in [
         del os.environ[name]
 os.environ["TERM"] = "xterm"
 
-if os.environ.get("CHECK_TYPES", "0") != "0":
-    from jaxtyping import install_import_hook
 
-    install_import_hook(["framework", "plugins"], "beartype.beartype")
+def names_shapes(annotation: Any) -> bool:
+    """Return whether an annotation contains an array of a given shape, or text that may stand for one."""
+    if isinstance(annotation, str | ForwardRef):
+        return True
+    if inspect.isclass(annotation) and issubclass(annotation, jaxtyping.AbstractArray):
+        return True
+    return any(map(names_shapes, get_args(annotation)))
+
+
+def install_type_checks() -> None:
+    """Check shapes and types of each call of the project's functions.
+
+    jaxtyping compares the shapes of arguments and result. It binds the arguments of each call for that, which takes ten
+    times as long as the checks of their types. So beartype alone checks functions without any shape in their signature.
+    """
+    check_shapes = jaxtyping.jaxtyped
+
+    def check(function: Any, *, typechecker: Any) -> Any:
+        if inspect.isfunction(function) and not any(map(names_shapes, function.__annotations__.values())):
+            return typechecker(function)
+        return check_shapes(function, typechecker=typechecker)
+
+    def choose_check(*, typechecker: Any) -> Callable[[Any], Any]:
+        return partial(check, typechecker=typechecker)
+
+    jaxtyping.jaxtyped = choose_check
+    jaxtyping.install_import_hook(["framework", "plugins"], "beartype.beartype")
+
+
+if os.environ.get("CHECK_TYPES", "0") != "0":
+    install_type_checks()
 
 
 def pytest_xdist_auto_num_workers() -> int:

@@ -315,21 +315,22 @@ def _label_constants(packages: set[str]) -> None:
                     _on_device[value] = False
 
 
-def _frames() -> Iterator[FrameType]:
-    """Yield the stack frames between the recorded call and this module, innermost first, without those of libraries."""
+def _caller() -> FrameType | None:
+    """Return the innermost stack frame of the recorded call; beartype may have added frames between it and here."""
     frame = sys._getframe(1)
     while frame is not None and (frame.f_code.co_filename, frame.f_code.co_name) != _ENTRY:
         frame = frame.f_back
-    frame = frame and frame.f_back
-    while frame is not None and frame.f_code.co_filename != __file__:
-        path, module = frame.f_code.co_filename, frame.f_globals.get("__name__", "")
-        if not path.startswith("<@beartype") and module.partition(".")[0] not in _LIBRARIES:
-            yield frame
-        frame = frame.f_back
+    return frame and frame.f_back
 
 
 _ENTRY = (__file__, "__torch_function__")
-"""File and function by which torch enters `OneDevice`; beartype may add frames between it and a function here."""
+"""File and function by which torch enters `OneDevice`."""
+
+
+def _of_library(frame: FrameType) -> bool:
+    """Return whether a stack frame is one of a library, or was added by beartype."""
+    path, module = frame.f_code.co_filename, frame.f_globals.get("__name__", "")
+    return path.startswith("<@beartype") or module.partition(".")[0] in _LIBRARIES
 
 
 def _has_device_code() -> bool:
@@ -337,30 +338,44 @@ def _has_device_code() -> bool:
 
     Only its code for the CPU runs here, so its calls say nothing about its code for a GPU.
     """
-    return any(_tests_device(frame.f_code) for frame in _frames())
+    frame = _caller()
+    while frame is not None and frame.f_code.co_filename != __file__:
+        code = frame.f_code
+        known, tests_device = _TESTS_DEVICE.get(id(code), (None, False))
+        if known is not code:
+            tests_device = not _of_library(frame) and _tests_device(code)
+            _TESTS_DEVICE[id(code)] = code, tests_device
+        if tests_device:
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _tests_device(code: CodeType) -> bool:
     """Return whether a function reads `is_cuda`, `is_cpu` or `device.type`."""
-    known = _TESTS_DEVICE.get(code)
-    if known is None:
-        known = bool({"is_cuda", "is_cpu"} & {*code.co_names})
-        if not known and "type" in code.co_names:
-            before = None
-            for instruction in dis.get_instructions(code):
-                known |= instruction.argval == "type" and before == "device"
-                before = instruction.argval
-        _TESTS_DEVICE[code] = known
-    return known
+    if {"is_cuda", "is_cpu"} & {*code.co_names}:
+        return True
+    before = None
+    for instruction in dis.get_instructions(code) if "type" in code.co_names else ():
+        if instruction.argval == "type" and before == "device":
+            return True
+        before = instruction.argval
+    return False
 
 
-_TESTS_DEVICE: dict[CodeType, bool] = {}
-"""Code of a function → result of `_tests_device` for it, so that it is computed once."""
+_TESTS_DEVICE: dict[int, tuple[CodeType, bool]] = {}
+"""Identity of the code of a function → the code, and whether it tests on which device a tensor is.
+
+Keys are no code objects, since Python computes their hash anew for each look-up.
+"""
 
 
 def _call_site() -> str:
     """Return file and line of the innermost call outside libraries, with the last three parts of the path."""
-    for frame in _frames():
-        path = frame.f_code.co_filename
-        return f"{'/'.join(path.split('/')[-3:])}:{frame.f_lineno}"
+    frame = _caller()
+    while frame is not None and frame.f_code.co_filename != __file__:
+        if not _of_library(frame):
+            path = frame.f_code.co_filename
+            return f"{'/'.join(path.split('/')[-3:])}:{frame.f_lineno}"
+        frame = frame.f_back
     return "an unknown line"

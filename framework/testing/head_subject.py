@@ -1,7 +1,8 @@
 """A density head under test, with seeded raw parameters and targets for it."""
 
+import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
@@ -34,6 +35,8 @@ class HeadSubject:
     seconds: float = TIME_LIMIT
     build_for: Callable[[Target], DensityHead] | None = None
     only: str = ""
+    _fitted: tuple[DensityHead, Tensor] | None = field(default=None, init=False, repr=False)
+    """Head that `make` copies, and the state of the random generator after its fit; None before the first."""
 
     def run_check(self, name: str, limit: float, check: Callable[[Worst], None]) -> Finding:
         """Run one check, with the row's limit if it has one for the property, and return the finding."""
@@ -46,10 +49,24 @@ class HeadSubject:
         """Return whether a property is to be checked."""
         return name not in self.row.leave_out and self.only in ("", name)
 
-    def make(self) -> DensityHead:
-        """Return a new head in evaluation mode."""
+    def build_anew(self) -> DensityHead:
+        """Build a head in evaluation mode, and fit it if it is a `Fitted` head."""
         seed(SEED)
         return self.build().eval()
+
+    def make(self) -> DensityHead:
+        """Return a new head in evaluation mode.
+
+        `Fitted` heads are copies of the first one, since fitting would take most of the time of the checks.
+        """
+        if self._fitted is None:
+            head = self.build_anew()
+            if not isinstance(head, Fitted):
+                return head
+            self._fitted = head, torch.default_generator.get_state()
+        head, state = self._fitted
+        torch.default_generator.set_state(state)
+        return copy.deepcopy(head)
 
     @cached_property
     def raw_shape(self) -> tuple[int, ...]:

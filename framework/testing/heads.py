@@ -68,11 +68,12 @@ def examine_head(subject: HeadSubject) -> Iterator[Finding]:
 
 def _on_one_device(subject: HeadSubject, worst: Worst) -> None:
     """Check that losses, calibration and all functions of the densities mix no devices."""
+    raw, value = subject.raw_parameters(2), subject.values(2)
 
     def calls(mode: OneDevice) -> Calls:
-        head = subject.make()
+        head = subject.build_anew()
         mode.label_module(head)
-        raw, value = mode.label_device((subject.raw_parameters(2), subject.values(2)))
+        mode.label_device((raw, value))
         pairs = mode.label_device(subject.raw_parameters(1, 2))
         index = mode.label_device(torch.tensor([[0], [1], [0]]))
         temperature = mode.label_device(torch.tensor(1.7, dtype=torch.float64))
@@ -198,7 +199,7 @@ def _repeatable(subject: HeadSubject, worst: Worst) -> None:
         worst.count(torch.equal(density.sample(many), density.sample(many)), "two successive draws are equal")
         head.eval()(2 + 3 * raw).sample()
         head.train().loss(2 + 3 * raw, value)
-        for comparison, other in {"two runs": head, "two heads": subject.make()}.items():
+        for comparison, other in {"two runs": head, "two heads": subject.build_anew()}.items():
             for name, again in compute_results(other).items():
                 worst.same_bits(f"{name} of {comparison}", again, first[name])
 
