@@ -110,7 +110,7 @@ def draw_curves(rows: list[dict[str, object]], path: Path) -> None:
         f"mean of {len(seeds)} seeds, band: standard deviation" if len(seeds) > 1 else "one seed, so no band"
     )
     upper.set_title(f"{several}; the axis is compressed below {CUT:g}".replace("-", "−"), fontsize=9)
-    lower.set_xlabel(f"standard deviation of the Gaussian blur (pixels of {SIDE})")
+    lower.set_xlabel(f"standard deviation σ of the Gaussian blur (1/{SIDE} of the width of an image)")
     figure.supylabel("mean log-likelihood of the pan angle (nats)", fontsize=10)
     upper.legend(fontsize=9, frameon=False)
     save_figure(figure, path.with_suffix(""), True)
@@ -212,7 +212,8 @@ def main(sweeps: list[Path], root: str | None) -> None:
         f"in units of 1/{SIDE} of the width of an image; the test images are {fields['input'].shape[-1]} pixels wide. "
         f"A uniform density has a log-likelihood of {UNIFORM:.2f}. The text at the top of `blur.py` lists the commands "
         "that train the models. The figure `blur.png` shows the same numbers, as in thesis Figure 3.7, and "
-        "`blur_strip.png` shows the densities that are predicted for one of the images, as in Figure 3.8.\n\n"
+        "`blur_strip.png` shows the densities that are predicted for one of the images, as in Figure 3.8; its unit px "
+        "is that of σ.\n\n"
         f"{markdown(named, COLUMNS)}\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"
     )

@@ -113,7 +113,7 @@ class Folds(Uncertainty, SelfTraining):
         return pooled
 
     def _groups(self, inputs: Tensor) -> list[Mixture]:
-        """Return the mixture of the models of each group, batch_shape (batch,)."""
+        """Return one mixture for each group, of the densities of its K models, batch_shape (batch,)."""
         mixtures = []
         for components in self.models.densities(inputs):
             like = next(self.parameters())
