@@ -35,7 +35,7 @@ class ChangedClass(Planted):
 
     @cached_property
     def kind(self) -> Any:
-        """The faulty class, always the same one, because encoders of two classes cannot be stacked."""
+        """The faulty class, always the same one: neither encoders nor states of two classes can be combined."""
         return type(self.base.__name__, (self.base,), dict(self.changes))
 
 

@@ -1,9 +1,7 @@
 """Metrics like those of other authors: correct ones, and ones with a planted fault that `mode=check` must find."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -12,6 +10,7 @@ from torch import Tensor
 from framework.metric import Metric
 from framework.prediction import Prediction
 from framework.target import Target
+from tests.planted_base import ChangedClass
 
 ONE, THREE = Target("angle", ("azimuth",)), Target("angle", ("azimuth", "elevation", "tilt"))
 HEIGHT, PLACE = Target("real", ("height",)), Target("real", ("x", "y"))
@@ -163,30 +162,17 @@ RIGHT = {
 
 
 @dataclass(frozen=True)
-class Fault:
+class Fault(ChangedClass):
     """A metric with one planted fault.
 
     Attributes:
-        name: description of the fault.
         target: target that the metric evaluates.
-        base: correct metric.
-        changes: methods of `base` that are replaced.
-        by: name of the check that must find the fault.
     """
 
-    name: str
-    target: Target
-    base: type[Metric]
-    changes: dict[str, Callable[..., Any]]
-    by: str
+    target: Target = HEIGHT
 
     def build(self) -> Metric:
         return self.kind()
-
-    @cached_property
-    def kind(self) -> type[Metric]:
-        """Class of the faulty metric, always the same one, because states of two classes cannot be merged."""
-        return type(self.base.__name__, (self.base,), dict(self.changes))
 
 
 def nothing_of(seen: Tensor) -> Tensor:
@@ -312,31 +298,31 @@ def per_batch(metric: Any, prediction: Prediction) -> None:
 SEM, TURNS, UNIT, NAN = "standard errors", "turns do not matter", "unit", "NaN is not hidden"
 BATCHES, ORDER, LEFT = "batches do not matter", "order does not matter", "predictions are left as they are"
 ALL_FAULTS = (
-    Fault("± is the deviation of samples", HEIGHT, Kept, {"spread": deviation_alone}, SEM),
-    Fault("± is half of an interval", PLACE, Kept, {"spread": half_interval}, SEM),
-    Fault("± is divided by n, not by its root", HEIGHT, Kept, {"spread": divided_by_count}, SEM),
-    Fault("± of degrees in radians", ONE, Turned, {"spread": in_radians}, SEM),
-    Fault("± of a root is that of the square", PLACE, Rooted, {"compute": squares_error}, SEM),
-    Fault("± counts every angle as a sample", THREE, Turned, {"each": every_number}, SEM),
-    Fault("angles are not wrapped", ONE, Turned, {"each": no_wrap}, TURNS),
-    Fault("angles are wrapped once", THREE, Turned, {"each": wraps_once}, TURNS),
-    Fault("targets are taken for degrees", ONE, Turned, {"each": of_degrees}, TURNS),
-    Fault("radians are called degrees", THREE, Turned, {"each": radians}, UNIT),
-    Fault("degrees are not said", ONE, Kept, {"each": unsaid_degrees}, UNIT),
-    Fault("bits are called nats, of classes", CLASSES, Surprise, {"each": in_bits}, UNIT),
-    Fault("bits are called nats, of an angle", ONE, Surprise, {"each": in_bits}, UNIT),
-    Fault("bits are called nats, of reals", PLACE, Surprise, {"each": in_bits}, UNIT),
-    Fault("the root is forgotten", PLACE, Rooted, {"compute": squares}, UNIT),
-    Fault("the point is overwritten", PLACE, Kept, {"each": overwritten}, LEFT),
-    Fault("the target is wrapped in place", ONE, Turned, {"each": wrapped_in_place}, LEFT),
-    Fault("a hundred of a batch", HEIGHT, Kept, {"each": first_hundred}, BATCHES),
-    Fault("a mean of batches' means", HEIGHT, Kept, {"each": batch_mean}, BATCHES),
-    Fault("shares of batches", CLASSES, Hit, {"update": per_batch}, BATCHES),
-    Fault("the last two hundred", HEIGHT, Kept, {"all": last_ones}, ORDER),
-    Fault("neighbours in a batch", PLACE, Kept, {"each": jumps}, ORDER),
-    Fault("odd ones are cut", HEIGHT, Kept, {"all": outliers_cut}, ORDER),
-    Fault("NaN is left out", PLACE, Kept, {"each": ignoring_nan}, NAN),
-    Fault("NaN is 0", HEIGHT, Kept, {"each": nan_is_0}, NAN),
-    Fault("computing divides the sum", CLASSES, Hit, {"compute": finished}, "computing changes nothing"),
-    Fault("merged states are averaged", CLASSES, Hit, {"__init__": averaged_states}, "states merge"),
+    Fault("± is the deviation of samples", SEM, Kept, {"spread": deviation_alone}, HEIGHT),
+    Fault("± is half of an interval", SEM, Kept, {"spread": half_interval}, PLACE),
+    Fault("± is divided by n, not by its root", SEM, Kept, {"spread": divided_by_count}, HEIGHT),
+    Fault("± of degrees in radians", SEM, Turned, {"spread": in_radians}, ONE),
+    Fault("± of a root is that of the square", SEM, Rooted, {"compute": squares_error}, PLACE),
+    Fault("± counts every angle as a sample", SEM, Turned, {"each": every_number}, THREE),
+    Fault("angles are not wrapped", TURNS, Turned, {"each": no_wrap}, ONE),
+    Fault("angles are wrapped once", TURNS, Turned, {"each": wraps_once}, THREE),
+    Fault("targets are taken for degrees", TURNS, Turned, {"each": of_degrees}, ONE),
+    Fault("radians are called degrees", UNIT, Turned, {"each": radians}, THREE),
+    Fault("degrees are not said", UNIT, Kept, {"each": unsaid_degrees}, ONE),
+    Fault("bits are called nats, of classes", UNIT, Surprise, {"each": in_bits}, CLASSES),
+    Fault("bits are called nats, of an angle", UNIT, Surprise, {"each": in_bits}, ONE),
+    Fault("bits are called nats, of reals", UNIT, Surprise, {"each": in_bits}, PLACE),
+    Fault("the root is forgotten", UNIT, Rooted, {"compute": squares}, PLACE),
+    Fault("the point is overwritten", LEFT, Kept, {"each": overwritten}, PLACE),
+    Fault("the target is wrapped in place", LEFT, Turned, {"each": wrapped_in_place}, ONE),
+    Fault("a hundred of a batch", BATCHES, Kept, {"each": first_hundred}, HEIGHT),
+    Fault("a mean of batches' means", BATCHES, Kept, {"each": batch_mean}, HEIGHT),
+    Fault("shares of batches", BATCHES, Hit, {"update": per_batch}, CLASSES),
+    Fault("the last two hundred", ORDER, Kept, {"all": last_ones}, HEIGHT),
+    Fault("neighbours in a batch", ORDER, Kept, {"each": jumps}, PLACE),
+    Fault("odd ones are cut", ORDER, Kept, {"all": outliers_cut}, HEIGHT),
+    Fault("NaN is left out", NAN, Kept, {"each": ignoring_nan}, PLACE),
+    Fault("NaN is 0", NAN, Kept, {"each": nan_is_0}, HEIGHT),
+    Fault("computing divides the sum", "computing changes nothing", Hit, {"compute": finished}, CLASSES),
+    Fault("merged states are averaged", "states merge", Hit, {"__init__": averaged_states}, CLASSES),
 )
