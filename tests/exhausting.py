@@ -15,7 +15,7 @@ import struct
 import sys
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -50,33 +50,70 @@ LONG = 5000
 REALS = Target("real", ("x", "y"))
 SECONDS = 10.0
 """Limit of the processor time of one case, seconds."""
+MUCH = 450.0
+"""Peak memory after which the next case runs in another process, megabytes."""
+Case = tuple[str, Callable[[], object], Callable[[], object]]
+"""Name of a case, what prepares it and does not count, and what is measured."""
 
 
 def case(name: str, action: Callable[[], object]) -> None:
     """Run a function in a fork, and print its outcome: "done", an error message, or another exception."""
-    reading, writing = os.pipe()
-    child = os.fork()
-    if child == 0:
-        signal.setitimer(signal.ITIMER_PROF, SECONDS)
-        try:
+    cases([(name, lambda: None, action)])
+
+
+def cases(pending: Sequence[Case]) -> None:
+    """Run functions one after another in a fork, and print the outcome of each.
+
+    A fork of this large process costs more than most functions. The remaining functions run in another fork after one
+    that was killed, and after one that took much memory, so that the peak of each is its own.
+    """
+    while pending:
+        reading, writing = os.pipe()
+        child = os.fork()
+        if child == 0:
             try:
-                action()
-                ended = "done"
-            except UserError as error:
-                ended = f"sentence: {error}"
-            except BaseException as error:
-                ended = f"raised: {type(error).__name__}: {error}"
-            os.write(writing, ended.encode()[:2000])
-        finally:
-            os._exit(0)
-    os.close(writing)
-    with os.fdopen(reading, "rb") as stream:
-        ended = stream.read().decode(errors="replace")
-    _, _, used = os.wait4(child, 0)
-    seconds, megabytes = used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
-    line = {"case": name, "ended": ended or "killed", "seconds": seconds, "megabytes": megabytes}
-    sys.stdout.write(f"{json.dumps(line)}\n")
-    sys.stdout.flush()
+                for name, prepare, action in pending:
+                    prepare()
+                    line = outcome(name, action)
+                    os.write(writing, json.dumps(line).encode() + b"\n")
+                    if line["megabytes"] > MUCH:
+                        break
+            finally:
+                os._exit(0)
+        os.close(writing)
+        with os.fdopen(reading, "rb") as stream:
+            lines = stream.read().decode().splitlines()
+        _, status, used = os.wait4(child, 0)
+        if len(lines) < len(pending) and (status != 0 or not lines):
+            seconds, megabytes = used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
+            name = pending[len(lines)][0]
+            killed = {"case": name, "ended": "killed", "seconds": seconds, "megabytes": megabytes}
+            lines.append(json.dumps(killed))
+        sys.stdout.write("".join(f"{line}\n" for line in lines))
+        sys.stdout.flush()
+        pending = pending[len(lines) :]
+
+
+def outcome(name: str, action: Callable[[], object]) -> dict[str, Any]:
+    """Run a function, and return how it ended, its processor time and the peak memory of this process."""
+    before = processor_seconds()
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    try:
+        action()
+        ended = "done"
+    except UserError as error:
+        ended = f"sentence: {error}"
+    except BaseException as error:
+        ended = f"raised: {type(error).__name__}: {error}"
+    signal.setitimer(signal.ITIMER_PROF, 0)
+    megabytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    seconds = processor_seconds() - before
+    return {"case": name, "ended": ended[:2000], "seconds": seconds, "megabytes": megabytes}
+
+
+def processor_seconds() -> float:
+    """Return the processor time of this process and of those that it has waited for."""
+    return sum(os.times()[:4])
 
 
 @dataclass
@@ -197,12 +234,15 @@ def stored_parameters(folder: Path) -> None:
         model.write(file, weights)
         with suppress(UserError):  # a data set may miss what travels with a model of its own
             predicted(file, model.inputs)  # what is imported and compiled once is not part of a case
+        pending = list[Case]()
         for place, values in asked:
             for value in values:
-                model.write(file, weights, put(model.config, (*model.place, *place), value))
                 said = f"{len(value)} items" if isinstance(value, list) else value
                 name = f"{model.name} {'.'.join(map(str, place))} = {said}"
-                case(name, partial(predicted, file, model.inputs))
+                config = put(model.config, (*model.place, *place), value)
+                prepare = partial(model.write, file, weights, config)
+                pending.append((name, prepare, partial(predicted, file, model.inputs)))
+        cases(pending)
 
 
 def stored_fields(folder: Path) -> None:
