@@ -207,14 +207,19 @@ def columns(
 def side_by_side(pictures: Mapping[str, UInt8[np.ndarray, "height width 3"]], synthetic: bool) -> Image.Image:
     """Return one image that shows the given images in a row, with their names below.
 
-    If `synthetic` is true, a note in the returned image says that the images are synthetic.
+    If `synthetic` is true, a note in the returned image says that the images are synthetic. The note stands in a line
+    of its own if the images are too narrow for it.
     """
     height, width = next(iter(pictures.values())).shape[:2]
-    sheet = Image.new("RGB", (width * len(pictures), height + CAPTION), "white")
-    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(11)
+    font = ImageFont.load_default(11)
+    fits = font.getlength(f"{[*pictures][-1]} {SAYS}") + 10 <= width
+    lines = 1 if fits or not synthetic else 2
+    sheet = Image.new("RGB", (width * len(pictures), height + lines * CAPTION), "white")
+    pen = ImageDraw.Draw(sheet)
     for number, (name, pixels) in enumerate(pictures.items()):
         sheet.paste(Image.fromarray(pixels), (number * width, 0))
         pen.text((number * width + 5, height + 1), name, "black", font)
     if synthetic:
-        pen.text((sheet.width - 5, height + 1), SAYS, (150, 0, 0), font, anchor="ra")
+        place = (sheet.width - 5, sheet.height - CAPTION + 1)
+        pen.text(place, SAYS, (150, 0, 0), font, anchor="ra")
     return sheet

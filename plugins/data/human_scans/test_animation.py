@@ -200,7 +200,7 @@ def test_a_run_and_a_motion_become_pictures_side_by_side(data, tmp_path, walks, 
     animate.main([*arguments, *(["test_0001", "--motion", str(tmp_path / "walk.bvh")] if walks else [])])
     assert "film.gif" in capsys.readouterr().out
     with Image.open(tmp_path / "new/film.gif") as film:
-        assert film.n_frames == 3 and film.size == (3 * width, height + animation.CAPTION)
+        assert film.n_frames == 3 and film.size == (3 * width, height + 2 * animation.CAPTION)
         first = np.asarray(film.convert("RGB")).astype(int)
         film.seek(1)
         second = np.asarray(film.convert("RGB")).astype(int)
@@ -232,11 +232,19 @@ def test_pictures_become_a_film_on_white(kind, tmp_path):
     sheets = frames(5)
     animate.write(tmp_path / f"film{kind}", sheets)
     with Image.open(tmp_path / f"film{kind}") as film:
-        assert film.n_frames == 5 and film.size == (64, 40 + animation.CAPTION)
+        # the note that the images are synthetic stands below their names
+        assert film.n_frames == 5 and film.size == (64, 40 + 2 * animation.CAPTION)
         film.seek(3)
         assert np.asarray(film.convert("RGB"))[:12, :32].min() >= (
             255 if kind == ".gif" else 250
         )  # the background
+
+
+def test_a_note_about_wide_images_stands_beside_their_names():
+    image = np.zeros((40, 200, 3), np.uint8)
+    for synthetic in (True, False):
+        sheet = animation.side_by_side({"mesh": image, "photograph": image}, synthetic)
+        assert sheet.size == (400, 40 + animation.CAPTION)
 
 
 def test_a_film_needs_its_program_and_people_who_are_there(data, tmp_path, monkeypatch):
