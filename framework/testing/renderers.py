@@ -246,7 +246,7 @@ def _sphere(renderer: Renderer, worst: Worst) -> None:
     if "depth" not in renderer.channels:
         worst.count(False, "the renderer does not draw depth")
         return
-    scene = sphere(rings=120)
+    scene = sphere(rings=72)
     depth = renderer(replace(scene, colors=None), ("depth",))["depth"].double()
     view = scene.camera
     y, x = torch.meshgrid(*[torch.arange(side, dtype=torch.float64) for side in SIZE], indexing="ij")
