@@ -238,18 +238,25 @@ def _quantile_in_trace(probability: Float[Tensor, "*shape"]) -> Float[Tensor, "*
     The relative error is about 1e-16 in float64 (Wichura 1988, algorithm AS 241, PPND16).
     """
     from_middle = probability - 0.5
-    middle = _ratio(0.180625 - from_middle.square(), _MIDDLE) * from_middle
     tail = torch.sqrt(-torch.log(torch.minimum(probability, 1 - probability)))
-    far = torch.where(tail <= 5, _ratio(tail - 1.6, _NEAR_TAIL), _ratio(tail - 5, _FAR_TAIL))
-    return torch.where(from_middle.abs() <= 0.425, middle, torch.where(from_middle < 0, -far, far))
+    middle, near, far = _ratios(torch.stack([0.180625 - from_middle.square(), tail - 1.6, tail - 5]))
+    outer = torch.where(tail <= 5, near, far)
+    outer = torch.where(from_middle < 0, -outer, outer)
+    return torch.where(from_middle.abs() <= 0.425, middle * from_middle, outer)
 
 
-def _ratio(argument: Tensor, coefficients: tuple[tuple[float, ...], tuple[float, ...]]) -> Tensor:
-    """Return the ratio of two polynomials; the coefficients of each begin with the one of the highest power."""
-    above, below = (torch.zeros_like(argument) for _ in range(2))
-    for first, second in zip(*coefficients, strict=True):
-        above, below = above * argument + first, below * argument + second
-    return above / below
+def _ratios(arguments: Float[Tensor, "3 *shape"]) -> Float[Tensor, "3 *shape"]:
+    """Return the ratios of two polynomials for the middle, the near tail and the far tail.
+
+    All six polynomials are evaluated at once: a trace of each operation by itself takes seconds.
+    """
+    # by powers, highest first; then numerator and denominator; then the three ratios
+    coefficients = torch.tensor([_MIDDLE, _NEAR_TAIL, _FAR_TAIL], dtype=torch.float64).permute(2, 1, 0)
+    coefficients = coefficients.to(arguments).reshape(*coefficients.shape, *(1,) * (arguments.dim() - 1))
+    value = coefficients[0]
+    for coefficient in coefficients[1:]:
+        value = value * arguments + coefficient
+    return value[0] / value[1]
 
 
 _MIDDLE = (
