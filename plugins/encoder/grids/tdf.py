@@ -4,6 +4,7 @@ import itertools
 import math
 from typing import Annotated
 
+import torch
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
@@ -63,31 +64,31 @@ def truncated_distance(
     """
     real = ~clouds[..., 0].isnan()
     reach = math.floor(truncation + 1 / 2)
-    squares, numbers = [], []  # for each axis and each step from a point's own cell along this axis
+    # the centre of a cell that is n steps away along an axis is at least n - 1/2 edges away along it
+    near = [max(abs(step) - 1 / 2, 0) ** 2 for step in range(-reach, reach + 1)]
+    squares, numbers = [], []  # for each axis, those of each step from a point's own cell
+    steps = torch.arange(-reach, reach + 1, dtype=clouds.dtype, device=clouds.device)[:, None, None]
     for axis, stride in enumerate((side * side, side, 1)):
         # in edges of a cell, from the cube's corner
         position = (clouds[..., axis].where(real, 0) + 1) / 2 * side
-        home = position.detach().floor().clamp(-side - 1, 2 * side + 1)
-        cells = [home + step for step in range(-reach, reach + 1)]
-        inside = [real & (cell >= 0) & (cell < side) for cell in cells]
-        squares.append(
-            [
-                (position - (cell + 1 / 2)).square().where(is_inside, math.inf)
-                for cell, is_inside in zip(cells, inside, strict=True)
-            ]
-        )
-        numbers.append([cell.clamp(0, side - 1).long() * stride for cell in cells])
+        cells = position.detach().floor().clamp(-side - 1, 2 * side + 1) + steps
+        inside = real & (cells >= 0) & (cells < side)
+        squares.append((position - (cells + 1 / 2)).square().where(inside, math.inf).unbind())
+        numbers.append((cells.clamp(0, side - 1).long() * stride).unbind())
     square = clouds.new_full((clouds.shape[0], side**3), truncation**2)
-    for x, y, z in itertools.product(range(2 * reach + 1), repeat=3):
-        # the centre of a cell that is n steps away is at least n - 1/2 edges away
-        if sum(max(abs(step - reach) - 1 / 2, 0) ** 2 for step in (x, y, z)) >= truncation**2:
+    for x, y in itertools.product(range(2 * reach + 1), repeat=2):
+        if near[x] + near[y] >= truncation**2:
             continue
-        number = numbers[0][x] + numbers[1][y] + numbers[2][z]
-        candidate = squares[0][x] + squares[1][y] + squares[2][z]
-        if candidate.requires_grad:
-            square = square.scatter_reduce(1, number, candidate, "amin")
-        else:
-            square.scatter_reduce_(1, number, candidate, "amin")
+        number_xy, square_xy = numbers[0][x] + numbers[1][y], squares[0][x] + squares[1][y]
+        for z in range(2 * reach + 1):
+            if near[x] + near[y] + near[z] >= truncation**2:
+                continue
+            number, candidate = number_xy + numbers[2][z], square_xy + squares[2][z]
+            # an operation in place takes a trace longer, and is the same one in ONNX
+            if candidate.requires_grad or torch.compiler.is_exporting():
+                square = square.scatter_reduce(1, number, candidate, "amin")
+            else:
+                square.scatter_reduce_(1, number, candidate, "amin")
     root = square.where(square > 0, 1).sqrt().where(square > 0, 0)  # the root of 0 has no derivative
     return root / truncation
 
