@@ -263,6 +263,16 @@ def arrays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exporting, "reader", lambda description: Arrays(description.input_shape))
 
 
+@pytest.fixture
+def untimed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the exporter measure no run times.
+
+    For them, it freezes each model, which may take as long as its export, and predicts for batches of 64 inputs again
+    and again.
+    """
+    monkeypatch.setattr(exporting, "_latency", lambda model, session, noises: {})
+
+
 class Drawing(Encoder):
     """A linear layer from six numbers to an image of raw parameters."""
 
@@ -290,20 +300,30 @@ def model_of(name: str, row: HeadRow) -> tuple[Predictor, tuple[int, ...]]:
 @pytest.mark.usefixtures("arrays")
 @pytest.mark.parametrize("name", ["gaussian", "mixture"])
 def test_an_exported_network_computes_the_same_parameters(name: str, tmp_path: Path) -> None:
-    check_export(name, rows(name)[0], tmp_path / "model")
+    content = check_export(name, rows(name)[0], tmp_path / "model")
+    assert content is not None
+    times = content["milliseconds"]
+    assert [*times] == ["1", "64"] and all(
+        [*forms] == ["torch", "frozen", "onnxruntime"] for forms in times.values()
+    )
+    assert all(time > 0 for forms in times.values() for time in forms.values())
 
 
-def check_export(name: str, row: HeadRow, into: Path) -> None:
-    """Export a model with this head, and see that the differences are small."""
+def check_export(name: str, row: HeadRow, into: Path) -> Mapping[str, Any] | None:
+    """Export a model with this head, see that the differences are small, and return its description.
+
+    The result is None if it is rightly refused because of its rounding.
+    """
     model, shape = model_of(name, row)
     try:
         content = exporting.export(model, describe(shape, row.target), into)
     except ConfigError as error:
         # float32 itself does not resolve all parameters for extreme inputs, on some processors
         assert name in ROUNDED and "1e-05 is allowed" in str(error) and "extreme inputs" in str(error)
-        return
+        return None
     require_parity(content)
     require_no_other_imports(into)
+    return content
 
 
 def require_parity(content: Mapping[str, Any]) -> None:
@@ -332,7 +352,7 @@ def test_a_head_that_numpy_cannot_compute_is_refused(name: str, tmp_path: Path) 
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("arrays")
+@pytest.mark.usefixtures("arrays", "untimed")
 @pytest.mark.parametrize("name", HEADS)
 def test_every_head_is_exported(name: str, tmp_path: Path) -> None:
     for number, row in enumerate(rows(name)):
@@ -340,7 +360,7 @@ def test_every_head_is_exported(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("arrays")
+@pytest.mark.usefixtures("arrays", "untimed")
 @pytest.mark.parametrize("name", installed("encoder"))
 def test_every_encoder_is_exported_or_refused_with_its_reason(name: str, tmp_path: Path) -> None:
     target = Target("class", ("a", "b", "c"))
@@ -366,7 +386,7 @@ def test_every_encoder_is_exported_or_refused_with_its_reason(name: str, tmp_pat
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("arrays")
+@pytest.mark.usefixtures("arrays", "untimed")
 def test_predictions_do_not_depend_on_the_other_inputs_of_a_batch(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -499,7 +519,7 @@ MALFORMED = (
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("arrays")
+@pytest.mark.usefixtures("arrays", "untimed")
 def test_the_service_predicts_and_refuses_malformed_requests(tmp_path: Path) -> None:
     target = rows("gaussian")[0].target
     model, shape = model_of("gaussian", rows("gaussian")[0])

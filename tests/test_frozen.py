@@ -14,7 +14,9 @@ from torch import Tensor, nn
 import framework
 from framework.configuration.assembly import build_predictor
 from framework.configuration.loading import PREFIX
+from framework.configuration.registry import installed
 from framework.configuration.schema import build, resolve
+from framework.density_head import Fitted
 from framework.deployment.frozen import freeze_predictor
 from framework.deployment.frozen_network import affine_logits, compute_layer, read_network, softmax
 from framework.encoder import Encoder
@@ -22,6 +24,7 @@ from framework.errors import CheckpointError
 from framework.geometry.clouds import pad
 from framework.model import FrozenFrontEnd, Model, Predictor
 from framework.target import Target
+from framework.testing.contract import contract
 from framework.training.checkpoint import WholeCheckpoints
 
 SEVEN = Target("class", tuple("abcdefg"))
@@ -106,6 +109,23 @@ def test_affine_logits_are_found_by_asking():
     mixture = {"components": 2, "component": "categorical"}
     assert affine_logits(head("mixture", SEVEN, **mixture)) is None
     assert affine_logits(head("gaussian", Target("real", ("x",)))) is None
+
+
+@pytest.mark.parametrize("name", installed("density_head"))
+def test_every_head_is_folded_rightly_or_left_to_torch(name):
+    for row in contract("density_head", name).rows:
+        made = build("density_head", resolve("density_head", {"name": name, **row.config}), target=row.target)
+        if isinstance(made, Fitted) or made.direct:
+            continue
+        logits = affine_logits(made)
+        assert (logits is not None) == (name in ("bernoulli", "categorical"))
+        if logits is not None:
+            matrix, constant = logits
+            raw = torch.randn(5, made.size, dtype=torch.float64)
+            density = made.double()(raw)
+            wanted = density.log_prob(density.enumerate_support()).exp().T
+            found = special.softmax(raw.numpy() @ matrix + constant, -1)
+            np.testing.assert_allclose(found, wanted.numpy(), rtol=1e-10)
 
 
 class Blocks(Encoder):
