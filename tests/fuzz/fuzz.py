@@ -19,6 +19,7 @@ to find the cause of a fault.
 """
 
 import argparse
+import gc
 import os
 import signal
 import sys
@@ -56,6 +57,8 @@ def main() -> int:
     if arguments.replay is not None:
         replay(chosen[0], arguments.replay)
         return 0
+    gc.collect()
+    gc.freeze()  # the garbage collection of a child process touches, and so copies, all that this process has made
     found: dict[str, Tally] = {}
     guards: set[str] = set()
     began = time.perf_counter()
