@@ -119,7 +119,11 @@ def test_a_run_that_is_fitted_at_once_logs_every_number_once(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    "how", ["is killed", "is killed, and closed by two", "is the job of a sweep that is killed", "closes"]
+    "how",
+    [
+        *("is killed", "is killed, and closed by two", "closes"),
+        pytest.param("is the job of a sweep that is killed", marks=pytest.mark.slow),
+    ],
 )
 def test_a_run_is_closed_whatever_becomes_of_its_process(how: str, tmp_path: Path) -> None:
     """A separate process closes the run; a job of a dead sweep is killed if it does not end by itself."""

@@ -99,15 +99,6 @@ def test_the_core_names_no_method() -> None:
     assert not faults(CORE, named)
 
 
-def test_imports_are_written_in_full() -> None:
-    def relative(path: Path) -> Iterator[int]:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.level:
-                yield node.lineno
-
-    assert not faults(CORE + PLUGINS, relative)
-
-
 def modules_of(folder: Path) -> dict[str, Path]:
     """Return the files below `folder` by the names of their modules."""
     files: dict[str, Path] = {}
@@ -273,8 +264,11 @@ def test_a_long_constructor_says_why() -> None:
     """A comment stands above each constructor of more than eight parameters."""
 
     def unexplained(path: Path) -> Iterator[str]:
-        lines = path.read_text(encoding="utf-8").splitlines()
-        for node in ast.walk(ast.parse("\n".join(lines))):
+        text = path.read_text(encoding="utf-8")
+        if "def __init__" not in text:
+            return
+        lines = text.splitlines()
+        for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.FunctionDef) and node.name == "__init__":
                 parameters = len([*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]) - 1
                 if parameters > 8 and not lines[node.lineno - 2].strip().startswith("#"):

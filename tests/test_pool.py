@@ -312,6 +312,7 @@ def test_the_processor_time_of_all_tries_is_recorded(app: App) -> None:
     assert 0 < idle < 0.5 <= once < 1 <= twice
 
 
+@pytest.mark.slow
 def test_processor_time_is_not_known_where_the_sweep_was_killed_or_the_config_changed(app: App) -> None:
     process = app.start("-m", "hydra/launcher=pool", "what=hold", "x=0,1", "hydra.launcher.jobs=1")
     app.until_ready(0)
@@ -535,8 +536,10 @@ def test_a_job_composes_the_config_the_sweep_composed(app: App) -> None:
     "sweeps",
     [
         ["x=0,1", "x=1,2", "x=3"],
-        ["x=5,5", "x=5", "x=6,5"],
-        *(pytest.param(sweeps, marks=pytest.mark.slow) for sweeps in (["x=0", "x=1"], ["x=0,1", "x=0,1"])),
+        *(
+            pytest.param(sweeps, marks=pytest.mark.slow)
+            for sweeps in (["x=5,5", "x=5", "x=6,5"], ["x=0", "x=1"], ["x=0,1", "x=0,1"])
+        ),
     ],
 )
 def test_sweeps_that_begin_at_once_in_one_folder_keep_their_jobs_apart(app: App, sweeps: list[str]) -> None:

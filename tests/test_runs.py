@@ -524,6 +524,7 @@ def test_predictions_of_a_folder_leave_out_what_is_no_input(framework: Framework
     assert [row.partition(",")[0] for row in rows] == [str(folder / "one.png"), str(folder / "two.png")]
 
 
+@pytest.mark.slow
 def test_a_run_killed_while_it_was_closed_is_sent_by_resume(framework: Framework) -> None:
     done = framework(*TINY, "trainer.max_epochs=1")
     assert done.code == 0, done.out

@@ -291,6 +291,7 @@ class Search:
         return [record["tries"] for record in self.jobs()]
 
 
+@pytest.mark.slow
 def test_a_search_ranks_its_trials_and_goes_on_where_it_was(tmp_path: Path) -> None:
     search = Search(tmp_path)
     unchecked = "from framework.sweeps import rehearsal\nrehearsal.COMMAND = [sys.executable, '-c', '']\n"

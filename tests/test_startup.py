@@ -112,6 +112,7 @@ def started(once: Once, stranger_site: Path) -> Path:
     return once("started", run)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", sorted(MODES.keys() - {"export"}))  # export uses nearly all of torch
 def test_a_mode_imports_only_what_it_uses(mode: str, started: Path) -> None:
     done = json.loads((started / f"{mode}.json").read_text())

@@ -138,6 +138,7 @@ def test_a_small_offset_is_found_again(body_model, gradient):
     assert torch.equal(descent(picture).parameters, fit.parameters)
 
 
+@pytest.mark.slow
 def test_the_density_knows_how_far_off_it_is(doll_images):
     batch = doll_images.splits().test.__getitems__(range(6))
     raw, target = batch["input"].flatten(1), batch["target"]

@@ -75,6 +75,7 @@ def fit(
     return head
 
 
+@pytest.mark.slow
 def test_constants_are_found_with_their_errors_at_any_height_of_the_table() -> None:
     """The simulated constants lie within four standard errors, which are not too wide either."""
     usual, moved = fit(), fit(torch.tensor([0.3, 0.0, 1.71]))

@@ -238,7 +238,10 @@ def test_uniform_rotations_have_the_entropy_of_the_chart():
     )
 
 
-@pytest.mark.parametrize("concentration", [1e4, 1e8, 1e12])
+@pytest.mark.parametrize(
+    "concentration",
+    [1e8, pytest.param(1e4, marks=pytest.mark.slow), pytest.param(1e12, marks=pytest.mark.slow)],
+)
 def test_concentrated_densities_are_normal(concentration):
     viewpoint = double([2.0, 0.6, -1.0])
     density = MatrixFisher(concentration * viewpoint_rotation(viewpoint))

@@ -122,6 +122,7 @@ def test_coverage_is_as_stated(problem, score, miscoverage):
         assert own.contains(label).double().mean().item() < 1 - miscoverage - 0.03
 
 
+@pytest.mark.slow
 def test_around_a_temperature_it_still_covers():
     inputs, label = moons(1500)
     generator = torch.Generator().manual_seed(1)
