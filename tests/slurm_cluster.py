@@ -97,18 +97,21 @@ class SlurmCluster:
             time.sleep(0.05)
 
     def kill_node(self, node: str) -> None:
-        """Kill the daemon of a node and every process that it has started, as when a machine loses its power."""
+        """Kill the daemon of a node and every process that it has started, as when a machine loses its power.
+
+        The processes that report the end of a job die before the job, so that nobody reports its end.
+        """
         _kill(int((self.folder / f"slurmd.{node}.pid").read_text()))
         marks = {f"SLURMD_NODENAME={node}".encode(), f"SLURM_CONF={self.folder}/slurm.conf".encode()}
-        doomed = set[int]()
+        jobs, reporters = set[int](), set[int]()
         for process in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):  # the process has ended
                 if marks <= set((process / "environ").read_bytes().split(b"\0")):
-                    doomed.add(int(process.name))
+                    jobs.add(int(process.name))
                     parent = int((process / "stat").read_text().rpartition(")")[2].split()[1])
                     if b"slurmstepd" in Path(f"/proc/{parent}/cmdline").read_bytes():
-                        doomed.add(parent)
-        for pid in doomed:
+                        reporters.add(parent)
+        for pid in (*reporters, *jobs):
             _kill(pid)
 
     def kill_script(self, number: str) -> None:
