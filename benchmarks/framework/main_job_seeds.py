@@ -94,13 +94,17 @@ def page(rows: list[dict[str, Any]]) -> str:
     differences = {name: paired(rows, name) for name in ERRORS}
     count = len(differences["log_likelihood"])
     texts = [mean_and_error(differences[name]) for name in ERRORS]
-    why = ", because fewer than five seeds are compared here" if count < 5 else ""
+    why = (
+        "because fewer than five seeds are compared here"
+        if count < 5
+        else "so that errors do not depend on whether a processor multiplies bfloat16 numbers fast"
+    )
     lines += [
         f"| bf16-mixed minus 32-true | {count} | {' | '.join(texts)} | |",
         "",
         "All runs used one thread, beside other work that kept both cores busy. Such work does not change errors, but "
         "it lengthens processor times; [main_job](main_job.md) has times of a quiet machine. The default of the "
-        f"experiment stays `32-true`{why}. "
+        f"experiment stays `32-true`, {why}. "
         "`trainer.precision=auto` chooses bfloat16 on a processor that multiplies bfloat16 numbers fast.",
         "",
         f"{machine('torch', 'pytorch-lightning')} Command: `python -m benchmarks.framework.main_job_seeds --seeds "
