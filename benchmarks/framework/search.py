@@ -93,8 +93,8 @@ SPACES = {
         "The names of the grids count the values of these settings in this order; a setting with one value keeps its "
         "default. The learning rates of the grids are 1e-3 and 1e-2, their dropout rates 0 and 0.25, their weight "
         "decays 1e-4 and 1e-2, and their batch sizes 32 and 128.",
-        "[search](search.md) has the same comparison in a smaller space. This page was made after its results were "
-        "known, in which the grids dominate the searches on moons.",
+        "[search](search.md) has the same comparison in a smaller space, in which the grids dominate the searches on "
+        "moons. That result was known before this space was chosen.",
     ),
 }
 """Compared search spaces by name."""

@@ -609,16 +609,11 @@ def _latency(model: Exporting, session: Session, noises: Sequence[ModelNoise]) -
 
 
 def _milliseconds(call: Callable[[], object], seconds: float = 0.1) -> float:
-    """Return the median processor time of a call, milliseconds, or that of the first call if it takes a second."""
-
-    def timed() -> float:
-        start = time.process_time()
-        call()
-        return time.process_time() - start
-
-    if (first := timed()) >= 10 * seconds:  # next to it, what only a first call does takes hardly any time
-        return 1e3 * first
+    """Return the median processor time of a call, milliseconds, after a first call that may compile and load code."""
+    call()
     times: list[float] = []
     while sum(times) < seconds and len(times) < 200:
-        times.append(timed())
+        start = time.process_time()
+        call()
+        times.append(time.process_time() - start)
     return 1e3 * median(times)

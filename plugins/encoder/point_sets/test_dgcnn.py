@@ -125,19 +125,19 @@ def test_points_in_one_place_and_one_point_alone_are_the_same_cloud():
 
 
 def test_mixed_precision_finds_the_same_neighbours(monkeypatch):
-    found = []
+    searches = []
 
     def recorded(*arguments):
-        found.append(nearest_rows(*arguments))
-        return found[-1]
+        searches.append(nearest_rows(*arguments))
+        return searches[-1]
 
     monkeypatch.setattr("plugins.encoder.point_sets.dgcnn.nearest_rows", recorded)
     encoder, clouds = build_encoder(edge_widths=[8]), torch.randn(2, 50, 3)
-    found.clear()
+    searches.clear()
     full = encoder(clouds)
     with torch.autocast("cpu", torch.bfloat16):
         mixed = encoder(clouds)
-    assert torch.equal(*found)
+    assert torch.equal(*searches)
     torch.testing.assert_close(mixed.float(), full, rtol=0.1, atol=0.1)
 
 

@@ -23,11 +23,11 @@ def test_neighbours_are_those_of_all_distances(numbers, length, dtype):
         part = values[start : start + number].double().numpy()
         distance = ((part[:, None] - part) ** 2).sum(-1)
         for row in range(number):
-            found = (index[start + row] - start).tolist()
+            nearest = (index[start + row] - start).tolist()
             wanted = np.argsort(distance[row], kind="stable")[:most].tolist()
-            assert set(found) == set(wanted)
-            assert sorted(found[: len(wanted)]) == sorted(wanted)
-            assert found[len(wanted) :] == [row] * (most - len(wanted))
+            assert set(nearest) == set(wanted)
+            assert sorted(nearest[: len(wanted)]) == sorted(wanted)
+            assert nearest[len(wanted) :] == [row] * (most - len(wanted))
         start += number
 
 

@@ -41,11 +41,11 @@ def test_the_divergence_of_classes_equals_scipys(dtype, tolerance, size):
     torch.manual_seed(0)
     raw = size * torch.randn(2, 5, 3, dtype=dtype)
     teacher, student = (head("categorical", CLASSES)(part) for part in raw)
-    found = from_teacher(teacher, student, 1)
+    divergence = from_teacher(teacher, student, 1)
     log_p, log_q = (special.log_softmax(part.double().numpy(), axis=-1) for part in raw)
     p = np.exp(log_p)
     expected = np.where(p > 0, p * (log_p - log_q), 0).sum(-1)
-    np.testing.assert_allclose(found.numpy(), expected, rtol=tolerance, atol=tolerance * size)
+    np.testing.assert_allclose(divergence.numpy(), expected, rtol=tolerance, atol=tolerance * size)
     torch.testing.assert_close(from_teacher(teacher, teacher, 1), torch.zeros(5, dtype=dtype), atol=0, rtol=0)
 
 

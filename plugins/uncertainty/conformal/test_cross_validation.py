@@ -93,7 +93,7 @@ def test_intervals_equal_the_definition(parts, miscoverage):
     """Compare with the definition of Barber et al. 2021, one input and one sample at a time."""
     wrapper, inputs, target = trained(parts=parts, miscoverage=miscoverage)
     model, new = wrapper.model, table(7, 99)[0]
-    found = value_set(wrapper(new))
+    intervals = value_set(wrapper(new))
     x, y, count = inputs.numpy(), target.numpy()[:, 0], len(inputs)
     for item, point in enumerate(new.numpy()):
         lows, highs = [], []
@@ -109,7 +109,9 @@ def test_intervals_equal_the_definition(parts, miscoverage):
         )
         low = sorted(lows)[first - 1] if first >= 1 else -math.inf
         high = sorted(highs)[last - 1] if last <= count else math.inf
-        np.testing.assert_allclose([found.low[item].item(), found.high[item].item()], [low, high], rtol=1e-9)
+        np.testing.assert_allclose(
+            [intervals.low[item].item(), intervals.high[item].item()], [low, high], rtol=1e-9
+        )
 
 
 @pytest.mark.parametrize(
@@ -125,8 +127,8 @@ def test_intervals_equal_those_of_mapie(parts, count, miscoverage):
     other.fit_conformalize(inputs.numpy(), target.numpy()[:, 0])
     new = table(200, 99)[0]
     _, ends = other.predict_interval(new.numpy(), allow_infinite_bounds=True)
-    found = value_set(wrapper(new))
-    np.testing.assert_allclose(np.stack([found.low, found.high], 1), ends[..., 0], rtol=1e-9)
+    intervals = value_set(wrapper(new))
+    np.testing.assert_allclose(np.stack([intervals.low, intervals.high], 1), ends[..., 0], rtol=1e-9)
 
 
 @pytest.mark.parametrize("parts, count", [(5, 50), (39, 39)], ids=["CV+", "jackknife+"])
@@ -210,10 +212,10 @@ def test_folds_are_the_models_around_which_it_works():
     assert 0.85 <= sets.contains(target).double().mean() <= 1
     folds.left_out = 1
     with torch.no_grad():
-        one = folds(inputs).log_prob(target)
+        by_left_out = folds(inputs).log_prob(target)
         folds.left_out = None
         folds.rows = (folds.part_of(torch.arange(60)) == 1).nonzero().flatten()[:1].expand(60)
-        assert torch.equal(one, folds(inputs).log_prob(target))
+        assert torch.equal(by_left_out, folds(inputs).log_prob(target))
         folds.rows = None
 
 
