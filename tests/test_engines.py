@@ -22,7 +22,9 @@ import pytest
 from framework.errors import ConfigError, UserError
 from framework.reports.table import COST_COLUMNS
 from framework.sweeps import slurm as slurm_engine
+from framework.sweeps.jobs import runs_elsewhere
 from framework.sweeps.node import NODE
+from framework.sweeps.ray_guard import cluster_processes, start_guard
 from framework.sweeps.ray_tasks import Ray, RaySettings
 from tests.conftest import PATIENCE, wait_for
 from tests.slurm_cluster import SlurmCluster, missing_programs
@@ -257,6 +259,7 @@ def test_a_sweep_begun_on_ray_is_finished_on_the_pool(ray_app: App) -> None:
     wait_for((ray_app.sweep / "3" / "closed SIGTERM").exists)
     records = [ray_app.record(number) for number in range(4)]
     assert [record["status"] for record in records] == ["completed", "failed", "died", "running"]
+    assert not any(map(runs_elsewhere, records))
     assert records[2]["error"].startswith("killed by SIGKILL on ")
     assert all(record["processor_seconds"] > 0 for record in records[:3])
     (ray_app.folder / "release").touch()
@@ -324,7 +327,8 @@ def test_a_local_cluster_of_ray_that_does_not_start_is_started_again(
     monkeypatch.setitem(sys.modules, "ray", ray)
     monkeypatch.setattr(os, "environ", dict(os.environ))
     if failures < 3:
-        Ray(RaySettings())
+        Ray(RaySettings()).close()
+        ended.pop()
     else:
         with pytest.raises(
             UserError, match=r"no cluster on this machine in 3 attempts \(The current node timed out"
@@ -335,6 +339,44 @@ def test_a_local_cluster_of_ray_that_does_not_start_is_started_again(
         starts.clear()
         Ray(RaySettings(address="127.0.0.1:1"))
     assert len(starts) == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere /proc does not list the processes")
+def test_the_processes_of_a_ray_cluster_are_ended_and_no_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The input of the guard ends as if the command had died; the processes ignore SIGTERM, as Ray's agents may."""
+    pytest.importorskip("ray", reason="pip install -e '.[ray]' installs Ray")
+    import ray
+
+    own, other = "a" * 64, "b" * 64
+    agent = [str(Path(ray.__file__).parent / "agent.py")]
+    script = "import signal, sys; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(); sys.stdin.read()"
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", script, *words],
+            env={**os.environ, "RAY_AUTH_TOKEN": token},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+        for token, words in ((own, agent), (other, agent), (own, ["-m", "framework"]))
+    ]
+    try:
+        for process in processes:
+            assert process.stdout is not None
+            process.stdout.readline()
+        assert cluster_processes(own) == [processes[0].pid]
+        monkeypatch.setenv("RAY_AUTH_TOKEN", own)
+        with start_guard() as guard:
+            assert guard.stdin is not None
+            guard.stdin.close()
+            assert processes[0].wait(PATIENCE) == -signal.SIGKILL
+            assert guard.wait(PATIENCE) == 0
+        assert [process.poll() for process in processes[1:]] == [None, None]
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
 
 
 @pytest.mark.slow

@@ -171,6 +171,7 @@ END_BY_THEMSELVES = {
     "store_process.py": "with their input",
     "repository.py": "within seconds, in which they read one commit",
     "pictures.py": "with their input",
+    "ray_guard.py": "when the command has ended",
     "slurm.py": "within seconds, in which SLURM answers",
 }
 """Files that start other processes, and when those end."""

@@ -12,6 +12,7 @@ from framework.reports.table import markdown, results_table, write_csv
 from framework.runs.job import find_job_folders, find_members, read_record
 from framework.runs.resuming import stored_config
 from framework.storage.progress import output
+from framework.sweeps.jobs import runs_elsewhere
 from framework.sweeps.results import Comparison, compare, comparison_figure, job_results
 from framework.tracking.ended import close_and_send
 from framework.tracking.run_info import Destination, RunInfo, read_run_info
@@ -155,7 +156,7 @@ def close_parent(folder: Path, files: Sequence[Path], summary: str, config: Mapp
     for file in files:
         tracker.log_artifact(file)
     records = [read_record(job) for job in find_job_folders(folder)]
-    if any(record.get("status") == "running" and record.get("handle") for record in records):
+    if any(map(runs_elsewhere, records)):
         tracker.leave_open()  # jobs of an engine go on without this command
     else:
         completed = all(record.get("status") == "completed" for record in records)

@@ -29,6 +29,8 @@ from framework.tracking.signals import CLOSED, ENDING, SIGNALS, Stopped, collect
 
 COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework")
 """Command of a job, to which its overrides are added. It is not a setting, because a config must not run code."""
+OUTLIVING = "slurm:"
+"""Beginning of the handles of jobs that outlive the sweep's command."""
 MOST_LISTED = 8
 """Largest number of jobs with the same error whose numbers are listed."""
 MOST_LOSSES = 3
@@ -84,7 +86,7 @@ class Job:
     @property
     def is_elsewhere(self) -> bool:
         """Return whether an engine whose jobs outlive the sweep may still run the job."""
-        return self.record.get("status") == "running" and self.record.get("handle") is not None
+        return runs_elsewhere(self.record)
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -114,6 +116,14 @@ class Job:
             return (
                 float(plain_numbers(json.loads(read_plain(path, LONGEST_VALUE)))) if path.is_file() else None
             )
+
+
+def runs_elsewhere(record: Mapping[str, Any]) -> bool:
+    """Return whether an engine whose jobs outlive the sweep may still run the job of a record.
+
+    The tasks of Ray also have a handle, but they end with the command.
+    """
+    return record.get("status") == "running" and str(record.get("handle")).startswith(OUTLIVING)
 
 
 def short_hash(*parts: str) -> str:
@@ -267,7 +277,7 @@ def run(
                 ):
                     queue.append(job)  # another sweep has started the job again
                     continue
-                if active.lock is None and not job.is_elsewhere:
+                if active.lock is None and job.record.get("status") != "running":
                     continue  # another sweep has recorded how the job ended
                 _end(active, code)
                 if sender is not None:

@@ -8,6 +8,7 @@ import logging
 import os
 import secrets
 import signal
+import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from framework.errors import ConfigError, UserError, shorten
 from framework.sweeps.engines import Process
 from framework.sweeps.node import NodeJob, read_node
+from framework.sweeps.ray_guard import start_guard
 
 _PASSED_ON = ("FRAMEWORK_", "MLFLOW_")
 """Beginnings of the names of environment variables that the jobs receive from this process; Ray passes on none."""
@@ -64,6 +66,7 @@ class Ray:
     def __init__(self, settings: RaySettings, connect: bool = True) -> None:
         self.threads = settings.cpus
         self._ray: Any = None
+        self._guard: subprocess.Popen[bytes] | None = None
         if connect:
             self._connect(settings)
 
@@ -78,6 +81,7 @@ class Ray:
                 "RAY_AUTH_MODE": "token",
                 "RAY_AUTH_TOKEN": secrets.token_hex(32),
             }
+            self._guard = start_guard()
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         import ray
 
@@ -107,6 +111,7 @@ class Ray:
                         "cluster on this machine."
                     ) from error
                 if start == _STARTS:
+                    self.close()
                     raise UserError(
                         f"Ray has started no cluster on this machine in {_STARTS} attempts ({reason}). Repeat the "
                         "command when the machine is less busy, or choose hydra/launcher=pool, which needs no Ray."
@@ -131,6 +136,9 @@ class Ray:
     def close(self) -> None:
         if self._ray is not None:
             self._ray.shutdown()
+        if self._guard is not None:
+            self._guard.kill()
+            self._guard.communicate()
 
 
 def run_task(job: NodeJob) -> None:
