@@ -248,6 +248,14 @@ class Tally:
     closed: int = 0
     same: int = 0
 
+    def add(self, other: "Tally") -> None:
+        """Add the counts of further kills."""
+        self.kills += other.kills
+        self.ended += other.ended
+        self.slowest = max(self.slowest, other.slowest)
+        self.closed += other.closed
+        self.same += other.same
+
 
 def runs(kind: Kind, folder: Path) -> list[Path]:
     return sorted(path.parent for path in folder.glob("*/job.json")) if kind.sweep else [folder]

@@ -4,11 +4,13 @@
 
 The test kills a command up to eight times, lets it finish, and compares what it has written, to the last bit, with the
 same command without a kill (`tests.fuzz.kills`). SLURM is included if its programs are on PATH. The folder keeps the
-counts, so that the command can be stopped and repeated. When all kills are made, the script writes soak.md into
-benchmarks/framework.
+counts, so that the command can be stopped and repeated. The kinds of kills that have the smallest part of their share
+come first; benchmarks/framework/soak.json holds the kills of all tests so far, which count as well. When all kills are
+made, the script writes soak.json and soak.md there. With --page it writes them earlier.
 """
 
 import argparse
+import datetime
 import json
 import os
 import random
@@ -23,15 +25,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-from benchmarks.pages import machine, write_page
-from framework.storage.files import hold_lock
+from benchmarks.pages import environment, write_page
+from framework.storage.files import hold_lock, write_whole
 from tests.fuzz.kills import ALLOWED, MARK, ROOT, RUN, Kind, Tally, killed, start
 from tests.slurm_cluster import SlurmCluster, missing_programs
 from tests.soak.events import EVENTS
 from tests.soak.kinds import Soaked, all_kinds, prepare
 
+RECORD = ROOT / "benchmarks/framework/soak.json"
+"""File with the counts of all soak tests so far, from which the page is written."""
 LEFT = 60.0
 """Seconds that must be left of --minutes for another command to start."""
 IN_A_ROW = 8
@@ -57,49 +61,86 @@ EVENT_ROWS = (
 
 
 @dataclass
-class State:
-    """Counts of a soak test, which are kept in its folder.
+class Counts:
+    """Counts of one soak test, or of several.
 
     Attributes:
+        began: Time of the first start, in ISO format; it identifies the test.
+        machine: Processor, date and versions.
+        commits: Names of the commits that were tested, as `git describe` writes them.
         tallies: Counts by kind and number of the signal.
-        durations: Seconds of each command without a kill.
         events: Number of repetitions, of kills and of faults of each event.
-        attempts: Number of commands that were killed, by kind.
         faults: What was lost or different.
     """
 
-    path: Path
+    began: str = ""
+    machine: str = ""
+    commits: list[str] = field(default_factory=list)
     tallies: dict[str, dict[int, Tally]] = field(default_factory=dict)
-    durations: dict[str, float] = field(default_factory=dict)
     events: dict[str, list[int]] = field(default_factory=dict)
-    attempts: dict[str, int] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
 
     @classmethod
-    def load(cls, path: Path) -> "State":
-        """Return the state in a file, or an empty one."""
-        if not path.is_file():
-            return cls(path)
-        values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    def parse(cls, values: dict[str, Any]) -> Self:
+        """Return the counts that `asdict` has turned into plain values."""
         tallies = {
             name: {int(number): Tally(**tally) for number, tally in by_signal.items()}
-            for name, by_signal in values.pop("tallies").items()
+            for name, by_signal in values["tallies"].items()
         }
-        return cls(path, tallies, **values)
-
-    def save(self) -> None:
-        """Write the state to its file."""
-        values = {key: value for key, value in asdict(self).items() if key != "path"}
-        self.path.write_text(json.dumps(values, indent=1), encoding="utf-8")
+        return cls(**{**values, "tallies": tallies})
 
     def kills(self, name: str) -> int:
         """Return the number of kills of one kind."""
         return sum(tally.kills for tally in self.tallies.get(name, {}).values())
 
+    def repetitions(self, name: str) -> int:
+        """Return the number of repetitions of one event."""
+        return self.events.get(name, [0])[0]
+
     @property
     def total(self) -> int:
         """Return the number of all kills."""
         return sum(map(self.kills, self.tallies)) + sum(kills for _, kills, _ in self.events.values())
+
+    def add(self, other: "Counts") -> None:
+        """Add the counts of another test."""
+        for name, by_signal in other.tallies.items():
+            for number, tally in by_signal.items():
+                self.tallies.setdefault(name, {}).setdefault(number, Tally()).add(tally)
+        for name, numbers in other.events.items():
+            self.events[name] = [
+                own + more for own, more in zip(self.events.get(name, [0, 0, 0]), numbers, strict=True)
+            ]
+        self.faults += other.faults
+
+
+@dataclass
+class State(Counts):
+    """Counts of the soak test in a folder, and what the test needs to go on.
+
+    Attributes:
+        durations: Seconds of each command without a kill.
+        attempts: Number of commands that were killed, by kind.
+    """
+
+    durations: dict[str, float] = field(default_factory=dict)
+    attempts: dict[str, int] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Return the state in a file, or an empty one."""
+        if path.is_file():
+            return cls.parse(json.loads(path.read_text(encoding="utf-8")))
+        return cls(began=datetime.datetime.now().isoformat(timespec="seconds"))
+
+    def counts(self) -> Counts:
+        """Return the counts without the rest of the state."""
+        return Counts(self.began, self.machine, self.commits, self.tallies, self.events, self.faults)
+
+
+def read_tests(path: Path) -> list[Counts]:
+    """Return the counts of all soak tests in a file; the list is empty without the file."""
+    return [Counts.parse(values) for values in json.loads(path.read_text("utf-8"))] if path.is_file() else []
 
 
 class Soak:
@@ -108,15 +149,19 @@ class Soak:
     Args:
         folder: Folder for the state, the inputs, and the runs of commands that are not killed.
         count: Number of kills.
-        seed: Seed of the moments of the kills.
     """
 
-    def __init__(self, folder: Path, count: int, seed: int = 0) -> None:
+    def __init__(self, folder: Path, count: int) -> None:
         self.folder = folder
         self.count = count
-        self.seed = seed
         folder.mkdir(parents=True, exist_ok=True)
         self.state = State.load(folder / "state.json")
+        self.earlier = [counts for counts in read_tests(RECORD) if counts.began != self.state.began]
+        describe = ["git", "describe", "--always", "--dirty", "--exclude=*"]
+        commit = subprocess.run(describe, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+        self.state.machine = environment("torch", "pytorch-lightning", "hydra-core", "mlflow", "ray")
+        if commit not in self.state.commits:
+            self.state.commits.append(commit)
         if not (folder / "inputs").is_dir():
             partial = folder / "inputs.partial"
             shutil.rmtree(partial, ignore_errors=True)
@@ -130,7 +175,7 @@ class Soak:
         whole = self.whole(kind)
         number = self.state.attempts[name] = self.state.attempts.get(name, 0) + 1
         tallies = self.state.tallies.setdefault(name, {})
-        draw = random.Random(f"{self.seed} {name} {number}")
+        draw = random.Random(f"{self.state.began} {name} {number}")
         folder = self.folder / "runs" / f"{_slug(name)}-{number}"
         before = self.state.kills(name)
         faults = killed(kind, folder, whole, self.state.durations[name], most, draw, tallies)
@@ -148,7 +193,7 @@ class Soak:
         whole = self.whole(reference)
         repetitions, kills, bad = self.state.events.get(name, [0, 0, 0])
         folder = self.folder / "runs" / f"{_slug(name)}-{repetitions}"
-        draw = random.Random(f"{self.seed} {name} {repetitions}")
+        draw = random.Random(f"{self.state.began} {name} {repetitions}")
         kill_count, faults = EVENTS[name](folder, whole, draw, self.state.durations[reference.name])
         self.state.events[name] = [repetitions + 1, kills + kill_count, bad + bool(faults)]
         self._note(name, repetitions, faults, folder)
@@ -165,12 +210,23 @@ class Soak:
             if command.process.wait(timeout=600):
                 raise RuntimeError(f"{kind.name} failed: {command.output}")
             self.state.durations[kind.name] = time.monotonic() - began
-            self.state.save()
+            self._save()
         return whole
+
+    @property
+    def counts(self) -> Counts:
+        """Return the counts of this test and of all earlier tests together."""
+        together = Counts()
+        for counts in (*self.earlier, self.state):
+            together.add(counts)
+        return together
+
+    def _save(self) -> None:
+        write_whole(self.folder / "state.json", json.dumps(asdict(self.state), indent=1).encode())
 
     def _note(self, name: str, number: int, faults: list[str], folder: Path) -> None:
         self.state.faults += [f"{name} {number}: {fault}" for fault in faults[:5]]
-        self.state.save()
+        self._save()
         if not faults:
             shutil.rmtree(folder, ignore_errors=True)
 
@@ -180,21 +236,22 @@ class Soak:
         repetitions = -(-TIMES * self.count // 200)
         broken = set[str]()
         while time.monotonic() < deadline - LEFT:
+            counts = self.counts
             left = {
                 soaked.kind.name: soaked
                 for soaked in kinds
-                if self.state.kills(soaked.kind.name) < wanted[soaked.kind.name]
+                if counts.kills(soaked.kind.name) < wanted[soaked.kind.name]
             }
-            due = [name for name in events if self.state.events.get(name, [0])[0] < repetitions]
+            due = [name for name in events if counts.repetitions(name) < repetitions]
             names = [name for name in (*left, *due) if name not in broken]
             if not names:
                 return not (left or due)
-            shares = {name: self.state.kills(name) / wanted[name] for name in left}
-            shares |= {name: self.state.events.get(name, [0])[0] / repetitions for name in due}
+            shares = {name: counts.kills(name) / wanted[name] for name in left}
+            shares |= {name: counts.repetitions(name) / repetitions for name in due}
             name = min(names, key=shares.__getitem__)
             try:
                 if name in left:
-                    faults = self.kill(left[name], min(IN_A_ROW, wanted[name] - self.state.kills(name)))
+                    faults = self.kill(left[name], min(IN_A_ROW, wanted[name] - counts.kills(name)))
                 else:
                     faults = self.happen(name)
             except (RuntimeError, ValueError, OSError, subprocess.SubprocessError) as error:
@@ -202,7 +259,7 @@ class Soak:
                 end_all(self.folder)
                 faults = [f"{type(error).__name__}: {error}"]
                 self._note(name, -1, faults, self.folder)
-            sys.stdout.write(f"{self.state.total} kills; {name}: {faults or 'equal'}\n")
+            sys.stdout.write(f"{self.counts.total} kills; {name}: {faults or 'equal'}\n")
             sys.stdout.flush()
         return False
 
@@ -236,10 +293,10 @@ def slurm_cluster() -> Iterator[SlurmCluster | None]:
 
 def page(soak: Soak, kinds: list[Soaked]) -> str:
     """Return the page of a soak test."""
-    state = soak.state
+    counts = soak.counts
     rows = []
     for soaked in kinds:
-        for number, tally in sorted(state.tallies.get(soaked.kind.name, {}).items()):
+        for number, tally in sorted(counts.tallies.get(soaked.kind.name, {}).items()):
             ended = "they go on" if soaked.kind.outlives else f"{tally.ended} ({tally.slowest:.1f} s)"
             closed = "–" if soaked.kind.outlives else str(tally.closed)
             rows.append(
@@ -248,20 +305,20 @@ def page(soak: Soak, kinds: list[Soaked]) -> str:
             )
     events = [
         f"| {name} | {repetitions} | {kills} | {bad} |"
-        for name, (repetitions, kills, bad) in state.events.items()
+        for name, (repetitions, kills, bad) in counts.events.items()
     ]
-    missing = [soaked.kind.name for soaked in kinds if not state.kills(soaked.kind.name)]
-    missing += [name for name in EVENTS if name not in state.events]
-    if not any(soaked.engine == "slurm" for soaked in kinds):
-        missing.append("sweeps on SLURM, whose programs were not on PATH")
+    missing = [soaked.kind.name for soaked in kinds if not counts.kills(soaked.kind.name)]
+    missing += [name for name in EVENTS if name not in counts.events]
+    tests = [test for test in (*soak.earlier, soak.state) if test.total]
     return "\n".join(
         [
             "# Soak test",
             "",
             "This page says whether anything is lost or different after kills at random moments. The test has "
-            f"killed {state.total} commands, or single processes of commands. Each command was killed at most "
+            f"killed {counts.total} commands, or single processes of commands. Each command was killed at most "
             "eight times, and was then repeated without a kill until it finished. The test is made by `python -m "
-            f"tests.soak {soak.count} --folder <folder>`, which is repeated until all kills are made.",
+            f"tests.soak {soak.count} --folder <folder>`, which is repeated until all kills are made. It adds its "
+            "kills to those of earlier tests, which `soak.json` holds. The end of the page lists the tests.",
             "",
             "The test has not yet killed the following commands and processes (each item names a command and, "
             f"after a comma, the process that is killed): {'; '.join(missing) or 'none'}.",
@@ -281,9 +338,14 @@ def page(soak: Soak, kinds: list[Soaked]) -> str:
             *rows,
             "",
             *([*EVENT_ROWS, *events, ""] if events else ()),
-            f"Faults: {'; '.join(state.faults) or 'none'}.",
+            f"Faults: {'; '.join(counts.faults) or 'none'}.",
             "",
-            machine("torch", "pytorch-lightning", "hydra-core", "mlflow", "ray"),
+            "The tests so far:",
+            "",
+            *(
+                f"- {test.total} kills at the commits {', '.join(test.commits)}, on {test.machine}"
+                for test in tests
+            ),
             "",
         ]
     )
@@ -299,19 +361,24 @@ def main() -> None:
     arguments.add_argument(
         "--only", default="", help="kill only commands whose name contains this regular expression"
     )
-    arguments.add_argument("--seed", type=int, default=0)
     arguments.add_argument("--page", action="store_true", help="write the page before all kills are made")
     options = arguments.parse_args()
     deadline = time.monotonic() + 60 * options.minutes
     os.environ.setdefault("FRAMEWORK_CACHE", str(options.folder.absolute() / "cache"))
     options.folder.mkdir(parents=True, exist_ok=True)
     with hold_lock(options.folder / ".lock"), slurm_cluster() as slurm:
-        soak = Soak(options.folder.absolute(), options.count, options.seed)
-        kinds = all_kinds(soak.folder / "inputs", slurm)
-        chosen = [soaked for soaked in kinds if re.search(options.only, soaked.kind.name)]
+        soak = Soak(options.folder.absolute(), options.count)
+        kinds = all_kinds(soak.folder / "inputs", {} if slurm is None else slurm.environment)
+        chosen = [
+            soaked
+            for soaked in kinds
+            if re.search(options.only, soaked.kind.name) and (slurm is not None or soaked.engine != "slurm")
+        ]
         complete = soak.run(chosen, [name for name in EVENTS if re.search(options.only, name)], deadline)
     if options.page or (complete and len(chosen) == len(kinds)):
-        write_page(ROOT / "benchmarks/framework/soak", page(soak, kinds))
+        tests = [asdict(counts) for counts in (*soak.earlier, soak.state.counts())]
+        write_whole(RECORD, (json.dumps(tests, indent=1) + "\n").encode())
+        write_page(RECORD, page(soak, kinds))
 
 
 if __name__ == "__main__":

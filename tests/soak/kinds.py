@@ -4,7 +4,7 @@ import csv
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,6 @@ from tests.fuzz.kills import (
     numbers,
     sweep,
 )
-from tests.slurm_cluster import SlurmCluster
 
 SHORT = ("logger=none", "pictures=false", "threads=1")
 """Settings of every command of the soak test that trains or tests."""
@@ -160,8 +159,13 @@ def pipelines(base: Path) -> dict[str, tuple[str, ...]]:
     return {name: (*settings, *SHORT, *STEPS) for name, settings in words.items()}
 
 
-def all_kinds(base: Path, slurm: SlurmCluster | None) -> list[Soaked]:
-    """Return all kinds of kills, with the inputs that `prepare` has written to `base`."""
+def all_kinds(base: Path, cluster: Mapping[str, str]) -> list[Soaked]:
+    """Return all kinds of kills.
+
+    Args:
+        base: Folder with the inputs that `prepare` has written.
+        cluster: Environment variables that name the SLURM cluster; empty without a cluster.
+    """
     model = f"checkpoint={base / 'model'}"
     encode = (
         "mode=encode",
@@ -173,7 +177,8 @@ def all_kinds(base: Path, slurm: SlurmCluster | None) -> list[Soaked]:
     )
     shares = ("mode.share=1/3,2/3,3/3", "mode.into={folder}/features", "hydra.launcher.jobs=2")
     moons = (*RUN, "seed=0,1,2", "hydra.launcher.jobs=2")
-    fork, ray = "hydra.launcher.fork=true", "hydra/launcher=ray"
+    fork, ray, slurm = "hydra.launcher.fork=true", "hydra/launcher=ray", "hydra/launcher=slurm"
+    slurm_conf = {name: value for name, value in cluster.items() if name == "SLURM_CONF"}
     clock = {"PYTHONPATH": os.pathsep.join((str(ROOT), str(ROOT / "tests/soak/clock"))), "CLOCK": "clock"}
     forest = (
         *(
@@ -186,7 +191,7 @@ def all_kinds(base: Path, slurm: SlurmCluster | None) -> list[Soaked]:
         "pictures=false",
     )
     renderer = ("experiment=smplpix/quick", "debug=fast", "trainer.max_epochs=10", *SHORT, *STEPS)
-    kinds = [
+    return [
         Soaked(Kind("training: moons", RUN, first, BOTH), 12),
         *(
             Soaked(Kind(f"training: {name}", words, first, BOTH), 4)
@@ -222,11 +227,6 @@ def all_kinds(base: Path, slurm: SlurmCluster | None) -> list[Soaked]:
         Soaked(jobs("a sweep on Ray, the worker of a job", *moons, ray, choose=ray_worker), 4, "ray"),
         Soaked(Kind("training while the clock goes back", RUN, first, environment=clock), 4),
         Soaked(sweep("a sweep while the clock goes back", first, fork, environment=clock), 4),
+        Soaked(sweep("a sweep on SLURM", first, slurm, outlives=True, environment=slurm_conf), 6, "slurm"),
+        Soaked(jobs("a sweep on SLURM, a job", *moons, slurm, environment=slurm_conf), 8, "slurm"),
     ]
-    if slurm is not None:
-        words, own = "hydra/launcher=slurm", {"SLURM_CONF": slurm.environment["SLURM_CONF"]}
-        kinds += [
-            Soaked(sweep("a sweep on SLURM", first, words, outlives=True, environment=own), 6, "slurm"),
-            Soaked(jobs("a sweep on SLURM, a job", *moons, words, environment=own), 8, "slurm"),
-        ]
-    return kinds
