@@ -50,6 +50,8 @@ JPEG_MARKER = re.compile(rb"\xff+([^\x00\x01\xd0-\xd7\xff])")
 """Pattern of a marker of a JPEG file; 00, 01 and D0 to D7 belong to the compressed pixels (ITU-T T.81, Table B.1)."""
 MODES = {1: "L", 3: "RGB", 4: "RGBA"}
 """Pillow's modes of decoded images, by number of channels."""
+READ_AT_ONCE = 2**16
+"""Largest size, in bytes, of a file that is read as a whole, although its header alone may be needed."""
 STRIP = 256
 """Number of pixel rows of an image that are converted at a time."""
 IN_MEMORY = 2 * 2**30
@@ -124,9 +126,15 @@ def open_image(file: Path) -> Iterator[Image.Image]:
             file, "an image", f"{reading.RESTORE} Scale the image down if it is too large."
         ),
         reading.open_regular(file) as stream,
-        open_stream(stream) as image,
+        open_stream(_read_at_once(stream)) as image,
     ):
         yield image
+
+
+def _read_at_once(stream: reading.Bounded) -> BinaryIO | BytesIO:
+    """Return the bytes of a small file in memory, because Pillow reads a file in dozens of pieces; else the file."""
+    small = os.fstat(stream.fileno()).st_size <= READ_AT_ONCE
+    return BytesIO(stream.read()) if small else stream
 
 
 @contextmanager

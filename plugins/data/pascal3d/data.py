@@ -22,10 +22,11 @@ from framework.renderer import Renderer
 from framework.storage import cache
 from framework.storage.generated import read_mark
 from framework.storage.names import as_bytes
+from framework.storage.parsed_files import ParsedFiles
 from framework.target import Target
 from plugins.data.pascal3d import layout
 from plugins.data.pascal3d.generator import VERSION, generate_class
-from plugins.data.pascal3d.layout import CLASSES, Annotation
+from plugins.data.pascal3d.layout import CLASSES, Annotation, Content
 
 SPLIT_SEED = 13  # the seed of the thesis authors' code
 MIRRORED = (-1.0, 1.0, -1.0)
@@ -165,15 +166,17 @@ class Pascal3D(Data):
         samples: dict[str, list[Sample]] = {"train": [], "validation": [], "test": []}
         for group, (category, root) in enumerate(roots.items()):
             lists = layout.split_lists(category)
+            parsed = layout.parsed_annotations(root, category)
             training = list(
-                self._select(root, category, lists["train"], self.selection.include_occluded, faults)
+                self._select(root, category, lists["train"], self.selection.include_occluded, faults, parsed)
             )
             held_out = validation_files(training, self.selection.validation_share)
             for annotation in training:
                 split = "validation" if annotation.file in held_out else "train"
                 samples[split].append(Sample(annotation, group))
-            test = self._select(root, category, lists["test"], False, faults)
+            test = self._select(root, category, lists["test"], False, faults, parsed)
             samples["test"] += [Sample(annotation, group) for annotation in test]
+            parsed.save()
         _refuse_wrong_labels(samples)
         self._read(samples, faults)
         self._digest = _digest(samples)
@@ -211,12 +214,13 @@ class Pascal3D(Data):
         lists: Sequence[tuple[str, Path]],
         include_occluded: bool,
         faults: list[DataError],
+        parsed: ParsedFiles[Content],
     ) -> Iterator[Annotation]:
         """Yield the objects of a split that the protocol uses; add the errors of unreadable files to `faults`."""
         names = [(source, name) for source, file in lists for name in layout.read_list(root / file)]
         for source, name in dict.fromkeys(names):
             try:
-                annotations = layout.read_annotations(root, category, source, name)
+                annotations = layout.read_annotations(root, category, source, name, parsed)
             except DataError as error:
                 faults.append(error)
                 continue

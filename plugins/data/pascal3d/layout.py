@@ -13,10 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from framework.datasets import matlab
 from framework.datasets.images import Box
 from framework.datasets.matlab import read_variables
 from framework.errors import DataError, quote
 from framework.storage.names import is_within
+from framework.storage.parsed_files import ParsedFiles
 from framework.storage.reading import read_bytes, translate_errors
 from framework.storage.text import lines_of
 
@@ -30,12 +32,10 @@ SUFFIXES = {"pascal": (".jpg", ".JPEG"), "imagenet": (".JPEG", ".jpg")}
 
 
 @dataclass(frozen=True)
-class Annotation:
-    """One object of the requested class.
+class Labels:
+    """Labels of one object of the requested class.
 
     Attributes:
-        file: File of the annotation.
-        image: Path of the image, which may not exist.
         box: Left, top, right and bottom edge, pixels from the corner of the image; it may reach beyond the image.
         angles: Azimuth, elevation and tilt in degrees, not wrapped to one turn; None if the object has no fine label.
         truncated, occluded, difficult: Flags of the annotation.
@@ -43,8 +43,6 @@ class Annotation:
         blur: Standard deviation of the blur of a generated image, pixels of the image; None for a real image.
     """
 
-    file: Path
-    image: Path
     box: Box
     angles: tuple[float, float, float] | None
     truncated: bool
@@ -52,6 +50,37 @@ class Annotation:
     difficult: bool
     symmetry: int
     blur: float | None
+
+
+@dataclass(frozen=True)
+class Annotation(Labels):
+    """One object of the requested class, with its files.
+
+    Attributes:
+        file: File of the annotation.
+        image: Path of the image, which may not exist.
+    """
+
+    file: Path
+    image: Path
+
+
+@dataclass(frozen=True)
+class Content:
+    """Content of an annotation file.
+
+    Attributes:
+        image: Path of the image as the file states it; it may be empty.
+        objects: Labels of the objects of the requested class.
+    """
+
+    image: str
+    objects: list[Labels]
+
+
+def parsed_annotations(root: Path, category: str) -> ParsedFiles[Content]:
+    """Return the contents of the annotation files of a class that earlier commands parsed."""
+    return ParsedFiles(root, f"pascal3d-{category}", Content, (Path(__file__), Path(matlab.__file__)))
 
 
 def check_root(root: Path, category: str) -> None:
@@ -120,7 +149,9 @@ def read_list(file: Path) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def read_annotations(root: Path, category: str, source: str, name: str) -> list[Annotation]:
+def read_annotations(
+    root: Path, category: str, source: str, name: str, parsed: ParsedFiles[Content] | None = None
+) -> list[Annotation]:
     """Return the objects of class `category` in one annotation file.
 
     Args:
@@ -128,18 +159,25 @@ def read_annotations(root: Path, category: str, source: str, name: str) -> list[
         category: Name of the class.
         source: Source of the image, "pascal" or "imagenet".
         name: Name of the image, without its ending.
+        parsed: Contents that need not be parsed again (`parsed_annotations`).
 
     Raises:
         DataError: The file is missing, is not a MATLAB file, or does not have the structure of an annotation.
     """
     file = root / "Annotations" / f"{category}_{source}" / f"{name}.mat"
-    with translate_errors(file, "a PASCAL3D+ annotation", "Copy it again from the release."):
-        return _objects(file, _load(file), root / "Images" / file.parent.name, category, source)
+
+    def parse(file: Path) -> Content:
+        with translate_errors(file, "a PASCAL3D+ annotation", "Copy it again from the release."):
+            return _content(file, _load(file), category)
+
+    content = parse(file) if parsed is None else parsed.get(file, parse)
+    image = _image(root / "Images" / file.parent.name, name, source, content.image)
+    return [Annotation(**vars(labels), file=file, image=image) for labels in content.objects]
 
 
-def _objects(file: Path, record: Struct, images: Path, category: str, source: str) -> list[Annotation]:
-    image = _image(images, file.stem, source, _text(record, "filename"))
-    annotations = []
+def _content(file: Path, record: Struct, category: str) -> Content:
+    """Return the content of an annotation file from its struct `record`."""
+    objects = []
     for number, entry in enumerate(_structs(record.get("objects")), start=1):
         if _text(entry, "class") != category:
             continue
@@ -151,10 +189,8 @@ def _objects(file: Path, record: Struct, images: Path, category: str, source: st
             )
         x1, y1, x2, y2 = corners
         symmetry = _number(entry, "symmetry")
-        annotations.append(
-            Annotation(
-                file=file,
-                image=image,
+        objects.append(
+            Labels(
                 box=(x1 - 1, y1 - 1, x2, y2),  # the file counts pixels from 1, and (x2, y2) is inside the box
                 angles=_angles(entry.get("viewpoint")),
                 truncated=bool(_number(entry, "truncated")),
@@ -164,7 +200,7 @@ def _objects(file: Path, record: Struct, images: Path, category: str, source: st
                 blur=_number(entry, "blur"),
             )
         )
-    return annotations
+    return Content(_text(record, "filename"), objects)
 
 
 def _load(file: Path) -> Struct:

@@ -18,6 +18,7 @@ from framework.datasets.fields import Fields
 from framework.datasets.images import Crop, Crops
 from framework.errors import ConfigError, DataError
 from framework.renderer import Renderer
+from framework.storage import parsed_files
 from framework.testing.data_samples import fields_of, prepared
 from framework.testing.sample_files import damaged_copies
 from plugins.data.pascal3d import layout
@@ -424,6 +425,36 @@ def change_objects(
         if len(changed) == only:
             return changed
     raise AssertionError(f"fewer than {only} annotations to change in {list_name}")
+
+
+def test_labels_that_an_earlier_command_parsed_are_used_until_their_file_changes(
+    root: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(parsed_files, "SETTLED", -(10**9))
+    first = prepare_data(root)
+    reads: list[Path] = []
+    read_variables = layout.read_variables
+
+    def count(file: Path, *arguments: Any) -> Any:
+        reads.append(file)
+        return read_variables(file, *arguments)
+
+    monkeypatch.setattr(layout, "read_variables", count)
+    second = prepare_data(root)
+    assert reads == []
+    assert second.fingerprint() == first.fingerprint()
+    assert second.excluded == first.excluded
+    for split in ("train", "validation", "test"):
+        assert all(
+            torch.equal(field, fields_of(first, split)[name])
+            for name, field in fields_of(second, split).items()
+        )
+    (name,) = change_objects(root, "car_val", lambda entry: entry["viewpoint"].update(azimuth=31.0))
+    reads.clear()
+    third = prepare_data(root)
+    assert [file.stem for file in reads] == [name]
+    assert third.fingerprint()["sha256"] != first.fingerprint()["sha256"]
 
 
 # ---- errors ----------------------------------------------------------------------------------------------
