@@ -141,10 +141,13 @@ def second_moments(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"
     q is the quaternion of the aligned rotation UᵀRV under the matrix Fisher density with λ = `falls`. The moments
     give the diagonal d of E UᵀRV, for example d₁ = 1 - 2(E q₂² + E q₃²).
     """
-    outer, inner, mass = _quadrature(falls)
+    return _second_moments(*_quadrature(falls))
+
+
+def _second_moments(outer: "_Circle", inner: "_Circle", mass: Tensor) -> Float[Tensor, "*batch 3"]:
+    """Return the moments of `second_moments` from the result of `_quadrature`."""
     mass = mass / mass.sum(-1, keepdim=True)
-    first = _sine_squared(outer.concentration)
-    third = _sine_squared(inner.concentration)
+    first, third = _sine_squared(outer), _sine_squared(inner)
     moments = [outer.square * first, inner.square * (1 - third), inner.square * third]
     return torch.stack([(mass * moment).sum(-1) for moment in moments], -1)
 
@@ -160,9 +163,9 @@ def fourth_moments(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 
     blocks = []
     for circle in (outer, inner):
         sine, both, sine_fourth = (
-            _sine_squared(circle.concentration),
-            _sine_cosine_squared(circle.concentration),
-            _sine_fourth(circle.concentration),
+            _sine_squared(circle),
+            _sine_cosine_squared(circle),
+            _sine_fourth(circle),
         )
         squares = circle.square * (1 - sine), circle.square * sine
         blocks.append((squares, circle.square**2 * (1 - sine - both), circle.square**2 * both, sine_fourth))
@@ -228,10 +231,12 @@ class _Circle(NamedTuple):
     Attributes:
         square: r² at each node.
         concentration: concentration of 2φ at each node.
+        bessel: I₀ₑ of the concentration at each node.
     """
 
     square: Tensor
     concentration: Tensor
+    bessel: Tensor
 
 
 def _quadrature(falls: Tensor) -> tuple[_Circle, _Circle, Tensor]:
@@ -259,10 +264,12 @@ def _quadrature(falls: Tensor) -> tuple[_Circle, _Circle, Tensor]:
     root = start * torch.sinh(y)
     w = end * root * root
     slope = 2 * end * root * start * torch.cosh(y)
-    outer = _Circle(1 - w, first / 2 * (1 - w))
-    inner = _Circle(w, stretch * w)
-    bessels = torch.special.i0e(inner.concentration) * torch.special.i0e(outer.concentration)
-    return outer, inner, weight * slope * torch.exp(-second * w) * bessels
+    outer, inner = _circle(1 - w, first / 2 * (1 - w)), _circle(w, stretch * w)
+    return outer, inner, weight * slope * torch.exp(-second * w) * (inner.bessel * outer.bessel)
+
+
+def _circle(square: Tensor, concentration: Tensor) -> _Circle:
+    return _Circle(square, concentration, torch.special.i0e(concentration))
 
 
 def legendre(count: int, device: torch.device) -> tuple[Tensor, Tensor]:
@@ -281,26 +288,31 @@ def _legendre_numbers(count: int) -> tuple[np.ndarray, np.ndarray]:
 # E sin²φ = (1-A)/2, E sin²φ cos²φ = A/(4κ), E sin⁴φ = (1-A)/2 - A/(4κ).
 
 
-def _sine_squared(concentration: Tensor) -> Tensor:
-    near, ratio = _ratio(concentration)
-    return torch.where(near, (1 - ratio) / 2, _series("sine_squared", concentration))
+def _sine_squared(circle: _Circle) -> Tensor:
+    return _with_series("sine_squared", circle, (1 - _ratio(circle)) / 2)
 
 
-def _sine_cosine_squared(concentration: Tensor) -> Tensor:
-    _, ratio = _ratio(concentration)
-    straight = ratio / concentration.clamp(min=1e-4) / 4
+def _sine_cosine_squared(circle: _Circle) -> Tensor:
+    concentration = circle.concentration
+    straight = _ratio(circle) / concentration.clamp(min=1e-4) / 4
     return torch.where(concentration < 1e-4, 1 / 8 - concentration.square() / 64, straight)
 
 
-def _sine_fourth(concentration: Tensor) -> Tensor:
-    near, ratio = _ratio(concentration)
-    close = (1 - ratio) / 2 - _sine_cosine_squared(concentration)
-    return torch.where(near, close, _series("sine_fourth", concentration))
+def _sine_fourth(circle: _Circle) -> Tensor:
+    close = (1 - _ratio(circle)) / 2 - _sine_cosine_squared(circle)
+    return _with_series("sine_fourth", circle, close)
 
 
-def _ratio(concentration: Tensor) -> tuple[Tensor, Tensor]:
-    """Return whether each concentration κ is small enough to compute 1 - A(κ) by subtraction, and A = I₁(κ)/I₀(κ)."""
-    return concentration < LARGE, torch.special.i1e(concentration) / torch.special.i0e(concentration)
+def _ratio(circle: _Circle) -> Tensor:
+    """Return A = I₁(κ)/I₀(κ) for each concentration κ."""
+    return torch.special.i1e(circle.concentration) / circle.bessel
+
+
+def _with_series(name: str, circle: _Circle, close: Tensor) -> Tensor:
+    """Return `close`, with the asymptotic series where κ is too large to compute 1 - A(κ) by subtraction."""
+    far = ~(circle.concentration < LARGE)
+    # the series is evaluated only where it applies, which is at a minority of the nodes
+    return close.masked_scatter(far, _series(name, circle.concentration[far]))
 
 
 def _series(name: str, concentration: Tensor) -> Tensor:
@@ -340,12 +352,15 @@ class _LogProb(Function):
     @staticmethod
     def forward(ctx: Any, turn: Tensor, parameter: Tensor) -> Tensor:
         frame = align(parameter)
-        ctx.save_for_backward(turn, parameter, *frame)
-        return log_height(frame.falls) - (frame.falls * frame.aligned(turn)[..., 1:].square()).sum(-1)
+        outer, inner, mass = _quadrature(frame.falls)
+        # the derivative needs moments; they are computed here, from the same quadrature as the normaliser
+        moments = _second_moments(outer, inner, mass) if ctx.needs_input_grad[1] else None
+        ctx.save_for_backward(turn, parameter, *frame, moments)
+        return -mass.sum(-1).log() - (frame.falls * frame.aligned(turn)[..., 1:].square()).sum(-1)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        turn, parameter, *parts = ctx.saved_tensors
+        turn, parameter, *parts, moments = ctx.saved_tensors
         frame = Frame(*parts)
         by_turn = by_parameter = None
         if torch.is_grad_enabled():  # for second derivatives, use operations that have derivatives
@@ -363,9 +378,7 @@ class _LogProb(Function):
                 by_turn = frame.turn(pull)
             if ctx.needs_input_grad[1]:
                 # R - E R = U ((Q - I) + (I - D)) Vᵀ; both terms in brackets are computed without cancellation
-                difference = quaternions.matrix_less_identity(aligned) + torch.diag_embed(
-                    _shrinkage(frame.falls)
-                )
+                difference = quaternions.matrix_less_identity(aligned) + torch.diag_embed(_shrinkage(moments))
                 by_parameter = frame.left @ difference @ frame.right.mT
         if by_turn is not None:
             by_turn = (grad[..., None] * by_turn).sum_to_size(turn.shape)
@@ -385,7 +398,7 @@ class _Mean(Function):
     def forward(ctx: Any, parameter: Tensor) -> Tensor:
         frame = align(parameter)
         ctx.save_for_backward(*frame)
-        return frame.left @ torch.diag_embed(1 - _shrinkage(frame.falls)) @ frame.right.mT
+        return frame.left @ torch.diag_embed(1 - _shrinkage(second_moments(frame.falls))) @ frame.right.mT
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Tensor:
@@ -413,9 +426,12 @@ class _Mean(Function):
         return frame.left @ moved @ frame.right.mT
 
 
-def _shrinkage(falls: Tensor) -> Tensor:
-    """Return 1 - dᵢ = 2 Σ_{j≠i} E qⱼ², (*batch, 3), where diag(d) is the mean of the aligned rotation UᵀRV."""
-    first, second, third = second_moments(falls).unbind(-1)
+def _shrinkage(moments: Float[Tensor, "*batch 3"]) -> Tensor:
+    """Return 1 - dᵢ = 2 Σ_{j≠i} E qⱼ², (*batch, 3), where diag(d) is the mean of the aligned rotation UᵀRV.
+
+    `moments` are E qᵢ² for i = 1, 2, 3 (`second_moments`).
+    """
+    first, second, third = moments.unbind(-1)
     return 2 * torch.stack([second + third, first + third, first + second], -1)
 
 
