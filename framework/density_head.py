@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import ClassVar
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.distributions import Distribution
@@ -83,6 +84,18 @@ class DensityHead(nn.Module, ABC):
         negative bound instead.
         """
         return -self(raw).log_prob(target)
+
+    def component_offsets(self, count: int) -> Float[Tensor, "count size"]:
+        """Return offsets of raw parameters with which `count` densities of this head start at different places.
+
+        A mixture adds them to the raw parameters of its components, because equal components would learn the same. The
+        default draws each number from N(0, 1). A head that knows the space of its target returns offsets that spread
+        the densities evenly over this space. Their numbers have a mean square of about 1.
+
+        Args:
+            count: number of components, at least 1.
+        """
+        return torch.randn(count, self.size)
 
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
         """Fit in place the parameters that gradients do not train, such as one concentration for all inputs.

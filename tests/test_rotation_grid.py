@@ -6,7 +6,14 @@ from scipy import stats
 
 from framework.geometry import quaternions
 from framework.geometry.rotation import geodesic_distance, viewpoint_rotation
-from framework.geometry.rotation_grid import cell_of, centres, level_of, mean_log_cosine, points_in
+from framework.geometry.rotation_grid import (
+    cell_of,
+    centres,
+    distant_rotations,
+    level_of,
+    mean_log_cosine,
+    points_in,
+)
 
 
 def random_viewpoints(count):
@@ -60,3 +67,18 @@ def test_mean_log_cosine_is_that_of_the_sphere():
 def test_other_numbers_of_cells_are_refused():
     with pytest.raises(ValueError, match="72, 576, 4608"):
         level_of(100)
+
+
+@pytest.mark.parametrize("count, least_deg", [(2, 179), (4, 179), (24, 80), (72, 50), (500, 25)])
+def test_distant_rotations_are_far_from_one_another(count, least_deg):
+    turns = distant_rotations(count)
+    torch.testing.assert_close(turns.norm(dim=-1), torch.ones(count, dtype=torch.float64))
+    first, second = torch.combinations(torch.arange(count)).unbind(-1)
+    matrices = quaternions.matrix_less_identity(turns) + torch.eye(3, dtype=torch.float64)
+    distance = geodesic_distance(matrices[first], matrices[second])
+    assert math.degrees(distance.min()) > least_deg
+
+
+def test_more_distant_rotations_than_the_finest_grid_spreads_are_refused():
+    with pytest.raises(ValueError, match="Got 200000 rotations, but at most 147456 can be spread"):
+        distant_rotations(200_000)

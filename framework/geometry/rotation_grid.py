@@ -25,6 +25,8 @@ OFFSET = 0.05
 
 Without it, angles of 0° and 90°, which many data contain, would lie on borders of cells.
 """
+FINER = 16
+"""Least number of cells, for each of the rotations that are chosen far from one another."""
 SUBDIVISION = 32
 """Number of parts into which each side of a pixel is divided to compute the mean of log cos e over the pixel."""
 
@@ -48,6 +50,31 @@ def centres(cells: int) -> Float[Tensor, "cells 3"]:
     index = torch.arange(cells)
     half = torch.full((cells,), 0.5, dtype=torch.float64)
     return points_in(index, half, half, half, cells)
+
+
+def distant_rotations(count: int) -> Float[Tensor, "count 4"]:
+    """Return `count` rotations that are far from one another, as unit quaternions, float64.
+
+    They are cells' centres of the coarsest grid with at least FINER cells for each rotation. Each is as far as possible
+    from the rotations before it (farthest-point order, Eldar et al. 1997); a smaller `count` gives the first ones of a
+    larger `count` on the same grid.
+
+    Raises:
+        ValueError: no grid is fine enough.
+    """
+    sizes = [SMALLEST * 8**level for level in range(6)]
+    cells = next((size for size in sizes if size >= FINER * count), None)
+    if cells is None:
+        raise ValueError(
+            f"Got {count} rotations, but at most {sizes[-1] // FINER} can be spread. Ask for fewer."
+        )
+    turns = quaternions.of_viewpoint(centres(cells))
+    chosen = [0]
+    nearest = (turns @ turns[0]).abs()  # cosine of half the angle to the nearest chosen rotation
+    for _ in range(count - 1):
+        chosen.append(int(nearest.argmin()))
+        nearest = torch.maximum(nearest, (turns @ turns[chosen[-1]]).abs())
+    return turns[chosen]
 
 
 def points_in(index: Int[Tensor, "..."], x: Tensor, y: Tensor, along: Tensor, cells: int) -> Tensor:

@@ -1,5 +1,6 @@
 """Parts that density heads of rotations share: the check of the target, and heads that read a matrix."""
 
+import math
 from typing import ClassVar
 
 import torch
@@ -8,6 +9,8 @@ from torch import Tensor
 
 from framework.density_head import DensityHead
 from framework.errors import ConfigError
+from framework.geometry import quaternions
+from framework.geometry.rotation_grid import distant_rotations
 from framework.heads.parameters import require_finite
 from framework.heads.viewpoints import MatrixDensity
 from framework.target import Target
@@ -69,3 +72,14 @@ class MatrixHead(DensityHead):
     def forward(self, raw: Float[Tensor, "*batch size"]) -> MatrixDensity:
         raw = require_finite(raw, self.size)
         return self.density(grown_matrix(raw.unflatten(-1, (3, 3)), self.largest), raw.dtype)
+
+    def component_offsets(self, count: int) -> Float[Tensor, "count 9"]:
+        """Return √3 R for `count` rotations R that are far from one another, all turned by one random rotation.
+
+        Independent numbers from N(0, 1) would leave large gaps between the modes, and most of the matrices would give
+        densities that are wide about one axis. |√3 R|² = 9 is the mean square of their norm.
+        """
+        turn = torch.nn.functional.normalize(torch.randn(4), dim=0).double()
+        spread = quaternions.product(turn, distant_rotations(count))
+        matrices = quaternions.matrix_less_identity(spread) + torch.eye(3, dtype=torch.float64)
+        return (math.sqrt(3) * matrices).flatten(1).to(torch.get_default_dtype())

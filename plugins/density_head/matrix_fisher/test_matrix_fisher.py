@@ -437,6 +437,21 @@ def test_picked_components_are_those_at_the_index():
 # ---- the head ------------------------------------------------------------------------------------------------
 
 
+def test_components_of_a_mixture_start_at_rotations_that_are_far_apart():
+    torch.manual_seed(0)
+    config = {"name": "mixture", "components": 24, "component": {"name": "matrix_fisher"}}
+    first, second = build_head(config), build_head(config)
+    offsets = first.spread.detach()
+    torch.testing.assert_close(offsets.square().mean(), torch.tensor(1.0))
+    modes = viewpoint_rotation(first(torch.zeros(1, first.size)).components.mode[0])
+    torch.testing.assert_close(modes.flatten(1) * math.sqrt(3), offsets, atol=1e-5, rtol=1e-5)
+    cosines = (modes[:, None] * modes[None]).sum((-2, -1)) / 2 - 1 / 2
+    assert cosines.fill_diagonal_(-1).max().acos().rad2deg() > 80
+    assert not torch.allclose(
+        offsets, second.spread, atol=0.1
+    )  # members of an ensemble start at different rotations
+
+
 def test_the_grown_matrix_is_smooth_at_zero_and_bounded():
     grow = partial(grown_matrix, largest=LARGEST_PARAMETER)
     zero = torch.zeros(3, 3).double().requires_grad_()

@@ -48,7 +48,7 @@ class MixtureHead(DensityHead):
         if components > 1:
             # raw parameters that all components share, and offsets that make the components differ from the first step
             self.size += component.size
-            self.spread = nn.Parameter(torch.randn(components, component.size))
+            self.spread = nn.Parameter(component.component_offsets(components))
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Mixture:
         """Return the density for raw parameters."""
