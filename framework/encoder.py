@@ -2,6 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from typing import ClassVar
 
 import torch
@@ -71,12 +72,16 @@ class FitsInputs(ABC):
     and no encoder that is trained may precede it. The encoder also returns features before it is fitted.
     """
 
+    needs_fit: bool = True
+    """False if this construction needs no fit; `fit_inputs` is then not called. The constructor may set it."""
+
     @abstractmethod
-    def fit_inputs(self, inputs: Float[Tensor, "sample *input"]) -> None:
+    def fit_inputs(self, batches: Iterable[Float[Tensor, "batch *input"]]) -> None:
         """Fit the encoder in place.
 
         Args:
-            inputs: inputs of the encoder for all samples of the training split.
+            batches: inputs of the encoder for all samples of the training split, batch by batch. Batches of point
+                clouds may be padded to different numbers of points.
         """
 
 

@@ -116,6 +116,9 @@ def test_what_cannot_be_encoded_is_refused(root, tmp_path):
     (tmp_path / "features").mkdir()
     with pytest.raises(ConfigError, match="pointnet is trained"):
         encode(collection, {**CONFIG, "encoder": [resolve("encoder", {"name": "pointnet"})]}, range(3), BATCH)
+    selected = {**CONFIG, "encoder": [resolve("encoder", {"name": "bps", "basis": "selected"})]}
+    with pytest.raises(ConfigError, match="bps with these settings is fitted to the training split"):
+        encode(collection, selected, range(3), BATCH)
     assert collection.missing() == [0, 1, 2]
 
 

@@ -21,7 +21,7 @@ from framework.configuration.modes import idle_sentence
 from framework.configuration.schema import build, resolve
 from framework.data import Data
 from framework.datasets.shards import INDEX, Shards, is_folder_of_shards, open_shards, part_name
-from framework.encoder import Encoder
+from framework.encoder import Encoder, FitsInputs
 from framework.errors import ConfigError, DataError, quote
 from framework.geometry.clouds import pad
 from framework.runs.introduction import introduce_threads, print_lines
@@ -410,7 +410,7 @@ def build_encoders(
         columns: Names of the numbers in the last dimension of an input; () if they have none.
 
     Raises:
-        ConfigError: An encoder is trained, or uses random numbers.
+        ConfigError: An encoder is trained, uses random numbers, or is fitted to training samples.
     """
     encoders: list[Encoder] = []
     for part in parts:
@@ -419,6 +419,11 @@ def build_encoders(
             raise ConfigError(
                 f"Encoder {part['name']} is trained or uses random numbers, but mode=encode stores features that "
                 "depend on the input only. Leave this encoder out, and train it on the stored features."
+            )
+        if isinstance(encoder, FitsInputs) and encoder.needs_fit:
+            raise ConfigError(
+                f"Encoder {part['name']} with these settings is fitted to the training split before training, but "
+                "mode=encode has no training split. Leave this encoder out, and use it in the training instead."
             )
         encoders.append(encoder.eval())
         shape, columns = encoder.output_shape, ()

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from collections.abc import Iterable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -9,6 +10,7 @@ import pytorch_lightning as pl
 import torch
 from pytorch_lightning.profilers import AdvancedProfiler, PyTorchProfiler, SimpleProfiler
 from rich.console import Console
+from torch import Tensor, nn
 from torch import distributed as dist
 
 from framework.configuration.loading import fill, predictor_weights
@@ -88,21 +90,29 @@ def _fit_encoders(session: Session) -> None:
     Raises:
         ConfigError: such an encoder follows an encoder that is trained.
     """
-    front = session.predictor.encoders if isinstance(session.predictor, FrozenFrontEnd) else ()
+    front = list(session.predictor.encoders) if isinstance(session.predictor, FrozenFrontEnd) else []
     for module in session.predictor.modules():
-        if isinstance(module, FitsInputs) and not any(module is encoder for encoder in front):
+        if (
+            isinstance(module, FitsInputs)
+            and module.needs_fit
+            and not any(module is encoder for encoder in front)
+        ):
             raise ConfigError(
                 f"{type(module).__name__} is fitted to the inputs before training, but an encoder that is trained "
                 "precedes it. Put it first in encoder=[...]."
             )
-    if not any(isinstance(encoder, FitsInputs) for encoder in front):
-        return
-    batches = session.batches()
-    inputs = torch.cat([batch["input"] for batch in batches.of(session.data.splits().train)])
-    for encoder in front:
-        if isinstance(encoder, FitsInputs):
-            encoder.fit_inputs(inputs)
-        inputs = encoder(inputs)
+    for number, encoder in enumerate(front):
+        if isinstance(encoder, FitsInputs) and encoder.needs_fit:
+            encoder.fit_inputs(_training_features(session, front[:number]))
+
+
+def _training_features(session: Session, encoders: Iterable[nn.Module]) -> Iterator[Tensor]:
+    """Yield the features that a chain of encoders returns for each batch of the training split."""
+    for batch in session.batches().of(session.data.splits().train):
+        features = batch["input"]
+        for encoder in encoders:
+            features = encoder(features)
+        yield features
 
 
 def _fit_at_once(session: Session, run: Run) -> float:

@@ -1,18 +1,20 @@
 """Basis point sets: features of a cloud relative to a fixed set of points."""
 
-from typing import Annotated
+from collections.abc import Iterable
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from framework.encoder import Encoder
+from framework.encoder import Encoder, FitsInputs
 from framework.errors import ConfigError
 from framework.geometry.clouds import Normalisation, require_clouds
 from framework.geometry.nearest import Queries
 from framework.storage.weights import FINITE, require_state
 from plugins.encoder.bps import basis as sets
+from plugins.encoder.bps import selection
 from plugins.encoder.bps.encoding import (
     Basis,
     channels,
@@ -24,7 +26,7 @@ from plugins.encoder.bps.encoding import (
 )
 
 
-class BPS(Encoder):
+class BPS(Encoder, FitsInputs):
     """Encoder that finds the cloud point nearest to each point of a fixed basis, and returns features of these points.
 
     The features are defined in thesis eq. 6.1-6.5.
@@ -35,19 +37,22 @@ class BPS(Encoder):
     Args:
         input_shape: (points, columns) of the largest cloud; coordinates in the first three columns.
         input_columns: names of the columns, if features are attributes.
-        basis: choice of basis points (`plugins.encoder.bps.basis`).
+        basis: choice of basis points (`plugins.encoder.bps.basis`); "selected": points of a random set that are chosen
+            before training by the distances of the training clouds (`plugins.encoder.bps.selection`).
         points: number of basis points, k; side³ for a "grid".
         radius: radius of the ball of basis points, or half the edge of a "grid", in units of the normalised cloud.
         features: names of the features of each basis point, in order: "distance" (1 number, eq. 6.4), "delta" (3
             numbers, eq. 6.5), and attributes of the nearest point: "color" (3 numbers: red, green, blue), "normal" (3
             numbers), or the name of a column (1 number).
         normalise: "unit_ball", "robust" or "none" (`framework.geometry.clouds.normalise_clouds`).
-        basis_seed: seed of "ball_uniform"; the run's seed has no influence.
+        basis_seed: seed of "ball_uniform" and of the points among which "selected" chooses; the run's seed has no
+            influence.
         rotation_invariant: whether to encode each cloud along its own axes (`plugins.encoder.bps.frame`).
 
     Raises:
-        ConfigError: the input is not a cloud; a feature is named twice or needs a column that the clouds lack; or
-            the basis is "grid" and `points` is not the cube of an integer.
+        ConfigError: the input is not a cloud; a feature is named twice or needs a column that the clouds lack; the
+            basis is "grid" and `points` is not the cube of an integer; or the basis is "selected" and `points` is more
+            than 2048.
     """
 
     fixed = True
@@ -61,7 +66,7 @@ class BPS(Encoder):
         input_shape: tuple[int, ...],
         input_columns: tuple[str, ...] = (),
         *,
-        basis: sets.Strategy = "ball_uniform",
+        basis: sets.Strategy | Literal["selected"] = "ball_uniform",
         points: Annotated[int, Field(gt=0, le=10_000_000)] = 512,
         radius: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
         features: Annotated[list[str], Field(min_length=1)] = ["distance"],  # noqa: B006 - never written
@@ -77,11 +82,19 @@ class BPS(Encoder):
             )
         for feature in features:
             columns_of(feature, input_columns)
+        if basis == "selected" and points > selection.MOST_POINTS:
+            raise ConfigError(
+                f"encoder bps: basis=selected chooses at most {selection.MOST_POINTS} basis points, but got "
+                f"points={points}. Choose fewer points, or another basis."
+            )
         self.columns = input_columns
         self.features = features
         self.normalise: Normalisation = normalise
         self.rotation_invariant = rotation_invariant
-        basis_points = sets.basis(basis, points, radius, basis_seed).to(torch.get_default_dtype())
+        self.needs_fit = basis == "selected"
+        self.radius, self.basis_seed = radius, basis_seed
+        strategy = "ball_uniform" if basis == "selected" else basis
+        basis_points = sets.basis(strategy, points, radius, basis_seed).to(torch.get_default_dtype())
         self.register_buffer("basis", basis_points)
         require_state(self, basis=FINITE)
         self._prepared: Basis | None = None
@@ -104,6 +117,26 @@ class BPS(Encoder):
             rotation_invariant=self.rotation_invariant,
         )
         return channels(encoding).reshape(-1, *self.output_shape)
+
+    @torch.no_grad()
+    def fit_inputs(self, batches: Iterable[Float[Tensor, "batch points columns"]]) -> None:
+        """Choose the basis points for the training clouds, the most informative first (`selection`)."""
+        count = len(self.basis)
+        points = sets.basis(
+            "ball_uniform", selection.candidate_count(count), self.radius, self.basis_seed
+        ).to(self.basis)
+        candidates = prepare_basis(points)
+        distances = (
+            encode(
+                clouds,
+                candidates,
+                normalise=self.normalise,
+                columns=self.columns,
+                rotation_invariant=self.rotation_invariant,
+            ).features["distance"]
+            for clouds in batches
+        )
+        self.basis.copy_(points[selection.select(distances, count).to(points.device)])
 
     def prepared_basis(self) -> Basis:
         """Return the basis prepared for search; it is prepared again only if its device, dtype or values changed."""

@@ -34,6 +34,7 @@ ROWS = {
             columns=COLUMNS,
             config={"points": 20, "features": ["distance", "delta", "normal"], "rotation_invariant": True},
         ),
+        CloudRow("selected, before the fit", CLOUD, config={"basis": "selected", "points": 20}),
         CloudRow("one basis point, one point", (1, 3), config={"points": 1}),
     )
 }

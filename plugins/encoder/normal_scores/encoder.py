@@ -1,5 +1,7 @@
 """Normal scores of numbers: the normal quantiles of their ranks among the training samples."""
 
+from collections.abc import Iterable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -58,8 +60,9 @@ class NormalScores(Encoder, FitsInputs):
         return torch.cat([numbers, (scores.gather(1, piece) + start * slopes.gather(1, piece)).T], 1)
 
     @torch.no_grad()
-    def fit_inputs(self, inputs: Float[Tensor, "sample *input"]) -> None:
+    def fit_inputs(self, batches: Iterable[Float[Tensor, "batch *input"]]) -> None:
         """Compute the stored values of each number, and their scores, from the training samples."""
+        inputs = torch.cat(list(batches))
         for number, column in enumerate(inputs.flatten(1).double().T):
             values, scores = fit_scores(column)
             # a shorter list is filled with its last value, so that the pieces behind it have the length 0

@@ -10,7 +10,7 @@ from plugins.encoder.normal_scores.encoder import KNOTS, NormalScores
 
 def fitted(inputs):
     encoder = NormalScores(tuple(inputs.shape[1:]))
-    encoder.fit_inputs(inputs)
+    encoder.fit_inputs(inputs.split(64))
     return encoder
 
 
