@@ -261,6 +261,12 @@ def runs(kind: Kind, folder: Path) -> list[Path]:
     return sorted(path.parent for path in folder.glob("*/job.json")) if kind.sweep else [folder]
 
 
+def shortest_job(kind: Kind, folder: Path) -> float:
+    """Return the seconds of the shortest job of a sweep; 0 for a command that is not a sweep."""
+    records = [json.loads((run / "job.json").read_text("utf-8")) for run in runs(kind, folder) if kind.sweep]
+    return min((record["ended"] - record["started"] for record in records), default=0.0)
+
+
 def start(kind: Kind, run: Path) -> Command:
     """Start the command of a run or sweep in the folder `run`; its output goes to the folder above."""
     return Command(kind.command(run), run.parent, **{"PYTHONPATH": str(ROOT), **kind.environment})
@@ -271,17 +277,24 @@ def killed(
 ) -> list[str]:  # fmt: skip
     """Kill one run or sweep `kills` times, let it finish, and compare it with the run that was not killed.
 
+    The moments of the kills are drawn from the duration of the command or, if the command goes on, from that of a job.
+
     Returns:
         Names of what differs, and of runs that have not finished.
     """
     folder.mkdir(parents=True)
     done: list[int] = []
     command: Command | None = None
+    job_seconds = shortest_job(kind, whole)
     while len(done) < kills:
         number = kind.numbers[sum(tally.kills for tally in tallies.values()) % len(kind.numbers)]
         share = draw.uniform(0.1, 0.9) if command is None else draw.uniform(0.05, 0.3)
         deadline = time.monotonic() + share * duration
         command = command or start(kind, folder / "it")
+        if kind.goes_on:
+            while command.process.poll() is None and not kind.choose(command):
+                time.sleep(0.05)
+            deadline = time.monotonic() + draw.uniform(0.0, 0.4) * job_seconds
         while command.process.poll() is None and (
             time.monotonic() < deadline or not (victims := kind.choose(command))
         ):
