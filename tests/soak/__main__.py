@@ -176,7 +176,7 @@ class Soak:
         number = self.state.attempts[name] = self.state.attempts.get(name, 0) + 1
         tallies = self.state.tallies.setdefault(name, {})
         draw = random.Random(f"{self.state.began} {name} {number}")
-        folder = self.folder / "runs" / f"{_slug(name)}-{number}"
+        folder = self._empty(f"{_slug(name)}-{number}")
         before = self.state.kills(name)
         faults = killed(kind, folder, whole, self.state.durations[name], most, draw, tallies)
         if self.state.kills(name) < before + most:  # it finished before a kill
@@ -192,7 +192,7 @@ class Soak:
             reference = Kind("event: one sweep", words, lambda command: [], sweep=True)
         whole = self.whole(reference)
         repetitions, kills, bad = self.state.events.get(name, [0, 0, 0])
-        folder = self.folder / "runs" / f"{_slug(name)}-{repetitions}"
+        folder = self._empty(f"{_slug(name)}-{repetitions}")
         draw = random.Random(f"{self.state.began} {name} {repetitions}")
         kill_count, faults = EVENTS[name](folder, whole, draw, self.state.durations[reference.name])
         self.state.events[name] = [repetitions + 1, kills + kill_count, bad + bool(faults)]
@@ -220,6 +220,12 @@ class Soak:
         for counts in (*self.earlier, self.state):
             together.add(counts)
         return together
+
+    def _empty(self, name: str) -> Path:
+        """Return a folder that does not exist; a test that was stopped may have left it."""
+        folder = self.folder / "runs" / name
+        shutil.rmtree(folder, ignore_errors=True)
+        return folder
 
     def _save(self) -> None:
         write_whole(self.folder / "state.json", json.dumps(asdict(self.state), indent=1).encode())
