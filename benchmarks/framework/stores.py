@@ -29,6 +29,8 @@ from framework.tracking.run_info import read_run_info
 from tests.store_server import Counts, StoreServer, count
 
 RUNS = 16
+EPOCHS = 1000
+"""Number of epochs of each run; the runs must still train when all of them have sent `LINES` lines."""
 LINES = 50
 """Number of lines of its journal that each run has sent when the server is killed."""
 AWAY = 30.0
@@ -80,12 +82,22 @@ class Sweep:
         self.process = subprocess.Popen(self.command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
 
     def wait_until_all_send(self) -> str:
-        """Wait until every job has sent `LINES` lines, and return how long it took and how many jobs were running."""
+        """Wait until every job has sent `LINES` lines, and return how long it took and how many jobs were running.
+
+        Raises:
+            RuntimeError: A job has already ended, so that the store would not be away during its training.
+        """
         while not all(_sent(job) >= LINES for job in self.jobs):
             if self.process.poll() is not None:
                 raise RuntimeError(f"the sweep ended before all jobs had sent {LINES} lines")
             time.sleep(0.2)
         running = sum(_status(job) == "RUNNING" for job in self.jobs)
+        if running < RUNS:
+            self.process.terminate()
+            self.process.wait()
+            raise RuntimeError(
+                f"only {running} of {RUNS} jobs were still running when all had sent {LINES} lines; train more epochs"
+            )
         return (
             f"after {time.monotonic() - self.begun:.0f} s. By then each job had sent {LINES} lines of its journal "
             f"or more, all jobs together {sum(map(_sent, self.jobs)):,} lines, and {running} of the {RUNS} jobs "
@@ -125,7 +137,7 @@ def measure_outage(server: StoreServer) -> list[str]:
     from mlflow import MlflowClient
 
     with tempfile.TemporaryDirectory() as name:
-        sweep = Sweep(600, Path(name) / "sweep")
+        sweep = Sweep(EPOCHS, Path(name) / "sweep")
         reached = sweep.wait_until_all_send()
         server.kill()
         time.sleep(AWAY)
@@ -150,7 +162,7 @@ def measure_loss(server: StoreServer) -> list[str]:
     from mlflow import MlflowClient
 
     with tempfile.TemporaryDirectory() as name:
-        sweep = Sweep(400, Path(name) / "sweep")
+        sweep = Sweep(EPOCHS, Path(name) / "sweep")
         reached = sweep.wait_until_all_send()
         server.kill()
         seconds = sweep.finish()

@@ -170,9 +170,11 @@ class Soak:
             partial.rename(folder / "inputs")
 
     def kill(self, soaked: Soaked, most: int = IN_A_ROW) -> list[str]:
-        """Kill a command a few times, and return what differs from the same command without a kill."""
+        """Kill a command a few times, and return what differs from the reference command without a kill."""
         kind, name = soaked.kind, soaked.kind.name
-        whole = self.whole(kind)
+        reference = soaked.reference or kind
+        whole = self.whole(reference)
+        self.state.durations.setdefault(name, self.state.durations[reference.name])
         number = self.state.attempts[name] = self.state.attempts.get(name, 0) + 1
         tallies = self.state.tallies.setdefault(name, {})
         draw = random.Random(f"{self.state.began} {name} {number}")
@@ -335,7 +337,8 @@ def page(soak: Soak, kinds: list[Soaked]) -> str:
             "takes them up again.",
             "- *closed*: afterwards, no `run.json` has the status RUNNING.",
             "- *equal*: after the command was repeated, weights, journal, results, predictions and features equal "
-            "those of the same command without a kill, to the last bit; costs are not compared.",
+            "those of the same command without a kill, to the last bit; costs are not compared. If jobs and workers on "
+            "Ray and SLURM are killed, the results are compared with those of the same sweep on the pool.",
             "- *the clock goes back*: in this kind of test, Python's clock is set back by one hour at each start "
             "of a process, and by one more hour every 2 s.",
             "",
@@ -381,7 +384,7 @@ def main() -> None:
             if re.search(options.only, soaked.kind.name) and (slurm is not None or soaked.engine != "slurm")
         ]
         complete = soak.run(chosen, [name for name in EVENTS if re.search(options.only, name)], deadline)
-    if options.page or (complete and len(chosen) == len(kinds)):
+    if options.page or (complete and not options.only):
         tests = [asdict(counts) for counts in (*soak.earlier, soak.state.counts())]
         write_whole(RECORD, (json.dumps(tests, indent=1) + "\n").encode())
         write_page(RECORD, page(soak, kinds))

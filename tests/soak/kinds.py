@@ -47,11 +47,13 @@ class Soaked:
         kind: the command and the process to kill.
         weight: number of kills of this kind among 200.
         engine: launcher of the sweep, if it is not the pool.
+        reference: kind whose undisturbed command gives the results to compare with; None: this kind.
     """
 
     kind: Kind
     weight: int
     engine: str = ""
+    reference: Kind | None = None
 
 
 def prepare(base: Path) -> None:
@@ -191,6 +193,7 @@ def all_kinds(base: Path, cluster: Mapping[str, str]) -> list[Soaked]:
         "pictures=false",
     )
     renderer = ("experiment=smplpix/quick", "debug=fast", "trainer.max_epochs=10", *SHORT, *STEPS)
+    pool_job = jobs("a sweep on the pool, a job", *moons, fork)
     return [
         Soaked(Kind("training: moons", RUN, first, BOTH), 12),
         *(
@@ -211,7 +214,7 @@ def all_kinds(base: Path, cluster: Mapping[str, str]) -> list[Soaked]:
         Soaked(jobs("encoding by a sweep, a job", *encode, *shares, fork, compare=same_features), 16),
         Soaked(sweep("a sweep on the pool", first, fork), 8),
         Soaked(sweep("a sweep on the pool, its fork server", fork_server, fork, goes_on=True), 8),
-        Soaked(jobs("a sweep on the pool, a job", *moons, fork), 24),
+        Soaked(pool_job, 24),
         *(
             Soaked(
                 jobs(
@@ -223,10 +226,12 @@ def all_kinds(base: Path, cluster: Mapping[str, str]) -> list[Soaked]:
         ),
         Soaked(sweep("a script that runs a sweep", first, fork, seeds=2, script=True), 4),
         Soaked(sweep("a sweep on Ray", first, ray, seeds=2), 4, "ray"),
-        Soaked(jobs("a sweep on Ray, a job", *moons, ray), 8, "ray"),
-        Soaked(jobs("a sweep on Ray, the worker of a job", *moons, ray, choose=ray_worker), 4, "ray"),
+        Soaked(jobs("a sweep on Ray, a job", *moons, ray), 8, "ray", pool_job),
+        Soaked(
+            jobs("a sweep on Ray, the worker of a job", *moons, ray, choose=ray_worker), 4, "ray", pool_job
+        ),
         Soaked(Kind("training while the clock goes back", RUN, first, environment=clock), 4),
         Soaked(sweep("a sweep while the clock goes back", first, fork, environment=clock), 4),
         Soaked(sweep("a sweep on SLURM", first, slurm, outlives=True, environment=slurm_conf), 6, "slurm"),
-        Soaked(jobs("a sweep on SLURM, a job", *moons, slurm, environment=slurm_conf), 8, "slurm"),
+        Soaked(jobs("a sweep on SLURM, a job", *moons, slurm, environment=slurm_conf), 8, "slurm", pool_job),
     ]
