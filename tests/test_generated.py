@@ -1,6 +1,9 @@
 """Generated data in the cache (framework.storage.generated), which are complete or absent, and generated only once."""
 
 import json
+import os
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -105,3 +108,74 @@ def test_everything_is_drawn_and_a_fault_is_passed_on() -> None:
 
     with pytest.raises(KeyboardInterrupt):
         draw_all(50, until_ten, "numbers")
+
+
+PROCESSES = """
+import os, signal, sys, threading
+from framework.errors import DataError
+from framework.storage import generated
+
+generated._may_fork = lambda: True  # also on a machine with one core
+
+def draw(number):
+    if sys.argv[1] == "raises" and number == 8:  # of the other process
+        raise DataError("number eight")
+    if sys.argv[1] == "is killed" and os.getpid() != parent:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if sys.argv[1] == "parent is killed" and os.getpid() == parent and number == 3:
+        os.kill(parent, signal.SIGKILL)
+    if sys.argv[1] == "parent is killed" and os.getpid() != parent:
+        threading.Event().wait(0.05)
+        print(number, flush=True)
+    return number, os.getpid()
+
+parent = os.getpid()
+count = 300
+try:
+    results = generated.draw_all(count, draw, "numbers", in_processes=True)
+except DataError as error:
+    print(error)
+else:
+    print([number for number, _ in results] == list(range(count)), len({process for _, process in results}))
+"""
+
+
+def drawn_by(case: str) -> str:
+    """Return the output of a process that draws 300 numbers in processes."""
+    command = [sys.executable, "-c", PROCESSES, case]
+    return subprocess.run(command, stdout=subprocess.PIPE, text=True, timeout=60).stdout
+
+
+def test_processes_return_all_results_in_order() -> None:
+    assert drawn_by("works") == "True 2\n"
+
+
+@pytest.mark.parametrize(
+    ("case", "message"),
+    [
+        ("raises", "number eight\n"),
+        (
+            "is killed",
+            "A process that was drawing numbers has ended early, perhaps because memory is short. Repeat",
+        ),
+    ],
+)
+def test_a_failure_in_another_process_is_raised(case: str, message: str) -> None:
+    assert drawn_by(case).startswith(message)
+
+
+def test_a_process_ends_with_the_one_that_it_draws_for() -> None:
+    """The output ends when both processes have ended; the rest of the numbers would take seven seconds."""
+    assert len(drawn_by("parent is killed").splitlines()) < 20
+
+
+def test_a_process_with_threads_is_not_forked() -> None:
+    ready = threading.Event()
+    thread = threading.Thread(target=ready.wait)
+    thread.start()
+    try:
+        results = draw_all(200, lambda number: (number, os.getpid()), "numbers", in_processes=True)
+    finally:
+        ready.set()
+        thread.join()
+    assert results == [(number, os.getpid()) for number in range(200)]

@@ -1,7 +1,7 @@
 """Generator of images in the layout of PASCAL3D+: annotation files, lists and images, and `synthetic.json`.
 
 The same class, number of images, seed and renderer give the same bytes. Each image has its own random stream, so the
-order in which threads draw the images does not matter.
+order in which threads or processes draw the images does not matter.
 """
 
 import io
@@ -77,17 +77,16 @@ def _draw_all(part: Path, category: str, images: int, seed: int, renderer: Rende
         with renderer_lock:
             return renderer(*arguments)
 
-    flags = [False] * images
-
-    def draw(number: int) -> None:
+    def draw(number: int) -> bool:
+        """Draw an image, and return whether it shows an object of the class that is not difficult."""
         split, name = names[number]
         random = np.random.default_rng([seed, sorted(FAMILIES).index(category), number])
         shot = shoot(category, random, render)
         _save(part, f"{category}_{split.partition('_')[0]}", name, shot)
-        flags[number] = any(entry.category == category and not entry.difficult for entry in shot.objects)
+        return any(entry.category == category and not entry.difficult for entry in shot.objects)
 
-    draw_all(images, draw, f"the synthetic {category} images")
-    _save_lists(part, category, names, flags)
+    easy = draw_all(images, draw, f"the synthetic {category} images", in_processes=True)
+    _save_lists(part, category, names, easy)
 
 
 def _names(images: int) -> Iterator[tuple[str, str]]:

@@ -224,16 +224,19 @@ def files_of(root: Path) -> dict[str, bytes]:
     }
 
 
-def test_generation_is_the_same_to_the_byte_for_any_number_of_threads(
+def test_generation_is_the_same_to_the_byte_for_any_number_of_threads_or_processes(
     tmp_path: Path, renderer: Renderer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     roots = []
     for painters in (1, 3):
         monkeypatch.setattr(generated, "PAINTERS", painters)
         roots.append(generator.generate_class(tmp_path / str(painters), "boat", 24, 5, renderer))
-    first, second = map(files_of, roots)
+    monkeypatch.setattr(generated, "WORTH_A_PROCESS", 1)
+    monkeypatch.setattr(generated, "_may_fork", lambda: True)
+    roots.append(generator.generate_class(tmp_path / "processes", "boat", 24, 5, renderer))
+    first, second, third = map(files_of, roots)
     assert len(first) == 2 * 24 + 5
-    assert first == second
+    assert first == second == third
     other = files_of(generator.generate_class(tmp_path / "other", "boat", 24, 6, renderer))
     assert first.keys() == other.keys()
     assert sum(first[name] == other[name] for name in first if name.endswith((".jpg", ".JPEG"))) == 0
