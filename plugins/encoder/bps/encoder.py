@@ -1,17 +1,17 @@
 """Basis point sets: features of a cloud relative to a fixed set of points."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
 from pydantic import Field
-from torch import Tensor
+from torch import Tensor, nn
 
 from framework.encoder import Encoder, FitsInputs
 from framework.errors import ConfigError
 from framework.geometry.clouds import Normalisation, require_clouds
-from framework.geometry.nearest import Queries
+from framework.geometry.nearest import Queries, prepare
 from framework.storage.weights import FINITE, require_state
 from plugins.encoder.bps import basis as sets
 from plugins.encoder.bps import selection
@@ -24,6 +24,12 @@ from plugins.encoder.bps.encoding import (
     prepare_basis,
     width,
 )
+
+SPEED = 10.0
+"""Factor by which a learned basis moves faster than the other parameters of a model, with an optimizer like Adam.
+
+The distances of a cloud change little if a basis point moves by the usual step of a weight.
+"""
 
 
 class BPS(Encoder, FitsInputs):
@@ -48,11 +54,15 @@ class BPS(Encoder, FitsInputs):
         basis_seed: seed of "ball_uniform" and of the points among which "selected" chooses; the run's seed has no
             influence.
         rotation_invariant: whether to encode each cloud along its own axes (`plugins.encoder.bps.frame`).
+        learned: whether the basis points are parameters that are trained with the model, starting from `basis` (like
+            the probing points of Li et al. 2016). The distance |x - b| of a basis point b from its nearest point x has
+            the gradient (b - x) / |b - x| in b. The encoder is then not `fixed`.
 
     Raises:
         ConfigError: the input is not a cloud; a feature is named twice or needs a column that the clouds lack; the
-            basis is "grid" and `points` is not the cube of an integer; or the basis is "selected" and `points` is more
-            than 2048.
+            basis is "grid" and `points` is not the cube of an integer; the basis is "selected" and `points` is more
+            than 2048; or `learned` is true, and the basis is "grid" or "selected" or no feature is "distance" or
+            "delta".
     """
 
     fixed = True
@@ -73,6 +83,7 @@ class BPS(Encoder, FitsInputs):
         normalise: Normalisation = "unit_ball",
         basis_seed: Annotated[int, Field(ge=0, lt=2**32)] = 13,
         rotation_invariant: bool = False,
+        learned: bool = False,
     ) -> None:
         super().__init__()
         require_clouds(input_shape, by="encoder bps")
@@ -87,6 +98,8 @@ class BPS(Encoder, FitsInputs):
                 f"encoder bps: basis=selected chooses at most {selection.MOST_POINTS} basis points, but got "
                 f"points={points}. Choose fewer points, or another basis."
             )
+        if learned:
+            _require_learnable(basis, features)
         self.columns = input_columns
         self.features = features
         self.normalise: Normalisation = normalise
@@ -96,6 +109,8 @@ class BPS(Encoder, FitsInputs):
         strategy = "ball_uniform" if basis == "selected" else basis
         basis_points = sets.basis(strategy, points, radius, basis_seed).to(torch.get_default_dtype())
         self.register_buffer("basis", basis_points)
+        self.fixed = not learned
+        self.moved = nn.Parameter(torch.zeros_like(basis_points)) if learned else None
         require_state(self, basis=FINITE)
         self._prepared: Basis | None = None
         total = sum(width(feature) for feature in features)
@@ -103,8 +118,12 @@ class BPS(Encoder, FitsInputs):
 
     def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
         """Return the features of the clouds."""
-        basis = self.prepared_basis()
-        if self.features == ["distance"] and self.normalise == "unit_ball" and not self.rotation_invariant:
+        learning = self.moved is not None and torch.is_grad_enabled()
+        basis = self._moving_basis() if learning else self.prepared_basis()
+        plain = (
+            self.features == ["distance"] and self.normalise == "unit_ball" and not self.rotation_invariant
+        )
+        if plain and not learning:
             distances = encode_distances(inputs, basis)
             if distances is not None:
                 return distances.reshape(-1, *self.output_shape)
@@ -138,15 +157,48 @@ class BPS(Encoder, FitsInputs):
         )
         self.basis.copy_(points[selection.select(distances, count).to(points.device)])
 
+    def basis_points(self) -> Float[Tensor, "k 3"]:
+        """Return the basis points; they have a gradient if they are learned."""
+        return self.basis if self.moved is None else self.basis + SPEED * self.moved
+
     def prepared_basis(self) -> Basis:
         """Return the basis prepared for search; it is prepared again only if its device, dtype or values changed."""
+        points = self.basis_points().detach()
         if torch.compiler.is_exporting():  # a trace compares no values
-            return Basis(self.basis, Queries(self.basis))
+            return Basis(points, Queries(points))
         cached = self._prepared
-        if cached is None or not _same(cached.points, self.basis):
+        if cached is None or not _same(cached.points, points):
             # a copy, which stays as it is if the buffer is changed in place
-            cached = self._prepared = prepare_basis(self.basis.clone())
+            cached = self._prepared = prepare_basis(points.clone())
         return cached
+
+    def _moving_basis(self) -> Basis:
+        """Return a learned basis, whose points have a gradient; it is prepared for a single search."""
+        points = self.basis_points()
+        return Basis(points, prepare(points, once=True))
+
+
+def _require_learnable(basis: str, features: Sequence[str]) -> None:
+    """Require a basis and features with which basis points can be learned.
+
+    Raises:
+        ConfigError: they cannot.
+    """
+    if basis == "grid":
+        raise ConfigError(
+            "encoder bps: learned=true moves the basis points, but basis=grid is for convolutions over a regular grid. "
+            "Choose another basis, such as ball_uniform, or set learned to false."
+        )
+    if basis == "selected":
+        raise ConfigError(
+            "encoder bps: basis=selected chooses the basis points before training, and learned=true trains them. Set "
+            "only one of them."
+        )
+    if not {"distance", "delta"} & set(features):
+        raise ConfigError(
+            f"encoder bps: learned=true needs a feature that changes with the basis points, but features={features} "
+            "are attributes of points of the cloud. Add distance or delta, or set learned to false."
+        )
 
 
 def _same(some: Tensor, other: Tensor) -> bool:

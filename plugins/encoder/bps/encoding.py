@@ -106,8 +106,8 @@ def encode(
     "distance" is the distance of the nearest point from the basis point (thesis eq. 6.4). "delta" is the vector from
     the basis point to the nearest point (eq. 6.5). "color", "normal" or the name of a column are attributes of the
     nearest point, unchanged ("x", "y", "z" are normalised). Distances and deltas are in units of the normalised cloud.
-    All features have the basis's dtype. They are differentiable in the clouds, except where another point becomes the
-    nearest.
+    All features have the basis's dtype. They are differentiable in the clouds and in the basis points, except where
+    another point becomes the nearest.
 
     Args:
         clouds: (batch, points, columns), padded as `framework.geometry.clouds` describes.
@@ -128,7 +128,7 @@ def encode(
     local, centre, scale = normalise_clouds(clouds, normalise, counts)
     reach_of_inliers = 1.0
     if normalise == "none" and not torch.compiler.is_exporting():  # a trace depends on no value
-        reach = max(1.0, float(basis.points.abs().max()))
+        reach = max(1.0, float(basis.points.detach().abs().max()))
         require_normalised(local[..., :3], reach, counts, by="encoder bps")
         reach_of_inliers = (
             LOOSE * reach
@@ -141,7 +141,8 @@ def encode(
     coordinates = local[..., :3].to(basis.points.dtype)
     neighbours = nearest(coordinates.detach(), basis.queries, counts)
     delta = None
-    if "delta" in columns_by_feature or ("distance" in columns_by_feature and coordinates.requires_grad):
+    has_gradient = coordinates.requires_grad or basis.points.requires_grad
+    if "delta" in columns_by_feature or ("distance" in columns_by_feature and has_gradient):
         delta = _gather_rows(coordinates, neighbours.index) - basis.points  # eq. 6.5
     values: dict[str, Tensor] = {}
     for feature, indices in columns_by_feature.items():
