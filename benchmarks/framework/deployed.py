@@ -207,9 +207,6 @@ def main() -> None:
         "nor returns a density. The exported folder does both with NumPy, which takes 0.01 to 0.3 ms more for one "
         "input. The frozen model does both with PyTorch, which takes longer. For basis points, the frozen model "
         "searches for the nearest points with compiled code, but an ONNX file can only multiply matrices.\n\n"
-        "`mode=export` refuses a model if the exported network differs too much from it, which may happen with "
-        "random weights. For extreme inputs, the numbers in the layers of such a model are large. If its result "
-        "is nevertheless close to 0, the rounding of these numbers to float32 is a large share of the result.\n\n"
         f"{machine('torch', 'onnxruntime', 'numpy')} Command: `python -m benchmarks.framework.deployed`.\n"
     )
     write_page(__file__, text)

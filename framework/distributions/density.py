@@ -92,11 +92,15 @@ class Mixture(PlainDensity):
     def split_values(self, value: Tensor) -> Sequence[Tensor]:
         """Return `value` (*sample, *batch, *event) in pieces along the first dimension that fit into memory.
 
-        For example, a grid of angles with many samples and many components must be split. While gradients are recorded,
-        nothing is split, and the only piece is `value`.
+        For example, a grid of angles with many samples and many components must be split. While gradients are recorded
+        or a program is exported, nothing is split, and the only piece is `value`.
         """
         extra = value.dim() - len(self.batch_shape) - len(self.event_shape)
-        if extra > 0 and value.shape[0] > self.rows and not torch.is_grad_enabled():
+        if (
+            torch.is_grad_enabled() or torch.compiler.is_exporting()
+        ):  # a program must not depend on the batch size
+            return [value]
+        if extra > 0 and value.shape[0] > self.rows:
             return value.split(self.rows)
         return [value]
 
