@@ -63,6 +63,27 @@ def test_every_experiment_composes_and_its_plugins_accept_it(name: str) -> None:
     assert trainer["keep"] == "last" or trainer["max_epochs"] % trainer["check_val_every_n_epoch"] == 0
 
 
+@pytest.mark.parametrize("base", ["moons/vanilla_128", "images/turned_mixture", "pascal3d_outliers/ensemble"])
+def test_an_experiment_in_a_folder_of_the_user_derives_from_one_of_the_project(
+    base: str, tmp_path: Path
+) -> None:
+    (tmp_path / "experiment/mine").mkdir(parents=True)
+    derived = f"# @package _global_\ndefaults:\n  - /experiment/{base}\n  - _self_\nbatch_size: 7\n"
+    (tmp_path / "experiment/mine/own.yaml").write_text(derived, encoding="utf-8")
+    own = plain(composed("experiment=mine/own", f"hydra.searchpath=[file://{tmp_path}]"))
+    assert own == plain(composed(f"experiment={base}")) | {"batch_size": 7}
+
+
+def test_the_project_names_the_bases_of_its_experiments_from_the_root() -> None:
+    """Hydra reads a name without the group as a name below the folder of the experiment that derives from it."""
+    relative = [
+        path.name
+        for path in (folder() / "experiment").rglob("*.yaml")
+        if re.search(r"(?m)^  - (?!/experiment/|override |_self_|[\w@/]+:)", path.read_text(encoding="utf-8"))
+    ]
+    assert not relative
+
+
 SMOKE_RUNS = {
     "caviar": "caviar/fixed_kappa",
     "idiap": "idiap/von_mises",
