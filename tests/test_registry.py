@@ -19,7 +19,7 @@ from framework.configuration.composition import PluginConfigs, register
 from framework.configuration.composition import folder as folder_of_configs
 from framework.configuration.registry import GROUPS, config_folders, find, installed, load, unusable_names
 from framework.errors import ConfigError
-from framework.modes.plugins import describe, print_plugins
+from framework.modes.plugins import describe, paper, print_plugins
 from framework.runs.provenance import package_versions
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -330,3 +330,10 @@ def test_a_package_that_hides_ours_is_named(tmp_path: Path, hiding: str) -> None
         told = ""
     assert told in done.stderr
     assert done.returncode == bool(told), done.stderr
+
+
+def test_the_paper_of_a_plugin_is_its_first_entry() -> None:
+    own = "@misc{own,\n  title = {Own files}\n}"
+    first = "@article{first,\n  author = {Doe, Ann and Roe, Jo},\n  title = {A method},\n  year = {2015}\n}"
+    assert paper(f"{first}\n{own}\n") == "Doe et al. 2015, A method"
+    assert paper(f"{own}\n{first}\n") == ""

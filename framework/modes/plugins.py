@@ -40,7 +40,8 @@ def print_plugins() -> None:
 
 
 def paper(bibtex: str) -> str:
-    """Return 'Author et al. 2015, Title' for a BibTeX entry; "" for an entry without an author."""
+    """Return 'Author et al. 2015, Title' for the first of some BibTeX entries; "" if it has no author."""
+    bibtex = re.split(r"(?m)^@", bibtex.strip().removeprefix("@"), maxsplit=1)[0]
     authors = _bibtex_value(bibtex, "author").split(" and ")
     if authors == [""]:
         return ""
