@@ -69,11 +69,11 @@ MEANINGS = {
     "uncertainty": "Uncertainty wrappers from the innermost to the outermost: `uncertainty=[ensemble,temperature]`.",
     "objective": "Objectives that are added to the loss: `objective=[outlier_exposure]`.",
     "metric": "Metrics of the test: `metric=[nll,accuracy]`.",
-    "renderer": "Renderer, for `mode=check`.",
+    "renderer": "Renderer, for `mode=render` and `mode=check`.",
     "optimizer": "Optimiser: `optimizer=adamw`, `adam` or `sgd`; see below.",
     "trainer": "Training: `trainer=default` or `ddp`; see below.",
     "budget": "Limit of run time or error, by which the knobs of a stored model are set; see below.",
-    "logger": "Store of the runs: `logger=mlflow` or `none`; see below.",
+    "logger": "Where the numbers of a run go: `logger=none`, or a list such as `[mlflow,csv,tensorboard]`; see below.",
     "mode.members": "Folder of a sweep, or a list of runs.",
     "mode.files": "Folder or files to read.",
     "mode.into": "Folder to write.",
@@ -177,7 +177,7 @@ def model_settings(model: type[BaseModel], file: str, prefix: str = "") -> list[
     return [
         Setting(
             prefix + key,
-            "names of plugins" if key in GROUPS else field_values(field),
+            "names of plugins" if not prefix and key in GROUPS else field_values(field),
             "see below" if isinstance(default, BaseModel) else code(written.get(key, default)),
             in_cell(
                 f"Refused: {UNUSED_BY_TRAINING[key]}."
@@ -339,4 +339,9 @@ def attribute_texts(model: type[BaseModel]) -> dict[str, str]:
         "settings", Path(inspect.getfile(model)), Path(inspect.getfile(model)).read_text("utf-8")
     )
     members = source[model.__name__].attributes
-    return {name: str(member.docstring.value) for name, member in members.items() if member.docstring}
+    texts = {name: str(member.docstring.value) for name, member in members.items() if member.docstring}
+    words = {"None": "null", "True": "true", "False": "false"}  # as a command writes them
+    return {
+        name: re.sub(r"\b(?:None|True|False)\b", lambda word: words[word[0]], text)
+        for name, text in texts.items()
+    }

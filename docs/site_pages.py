@@ -28,6 +28,8 @@ RESULTS = ("benchmarks/**/*.md", "reproduction/**/*.md", "tests/fuzz/*.md")
 OTHERS = ("CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md")
 LINK = re.compile(r"(!?\[(?:[^\[\]]|\[[^\[\]]*\])*\]\()([^)\s#]*)(#[^)\s]*)?(\))")
 ITEM = re.compile(r"\s*(?:[-*+]|\d+\.) ")
+WIDE = re.compile(r"(?m)^\|(?:[ :-]+\|){8,}$")
+"""Line below the heading of a table with at least eight columns."""
 
 
 @cache
@@ -203,4 +205,6 @@ def on_page_markdown(markdown: str, page: "Page", config: "MkDocsConfig", files:
         if f"docs/{target}" in map(str, tutorials()):
             markdown += f"\n[Download this page as a notebook]({Path(target).stem}.ipynb)\n"
         markdown = markdown.replace("<!-- results -->", translate(results(), "README.md", target)[0])
+    if WIDE.search(markdown):
+        page.meta["hide"] = ["toc"]  # its column gives the tables a third more width
     return spaced_lists(markdown)
