@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from framework.configuration.schema import build, resolve
+from framework.configuration.settings import Settings
 from framework.evaluation import cost
 from framework.evaluation.cost import Cost, device_name, measure, peak_memory, wall_time
 from framework.evaluation.splits import cost as evaluated_cost
@@ -148,3 +149,17 @@ def test_an_empty_batch_is_refused(inputs: Tensor) -> None:
 def test_impossible_limits_are_refused(repeats: int, budget: float) -> None:
     with pytest.raises(ValueError, match="budget_seconds above 0"):
         wall_time(lambda: None, CPU, repeats=repeats, budget_seconds=budget)
+
+
+@pytest.mark.parametrize(
+    ("trainer", "short"),
+    [
+        ({"max_epochs": 1, "limit_train_batches": 3}, True),
+        ({"max_epochs": 4, "limit_train_batches": 3}, False),
+        ({"max_epochs": 1, "limit_train_batches": 0.5}, False),
+        ({"max_epochs": 1}, False),
+        ({"max_epochs": None, "limit_train_batches": 3}, False),
+    ],
+)
+def test_only_a_run_of_few_batches_is_a_short_test(trainer: dict[str, float | None], short: bool) -> None:
+    assert Settings.of({"trainer": trainer}).is_short_test == short

@@ -423,6 +423,12 @@ class Settings(_Strict):
         return CallbackSettings.model_validate(self.trainer.get("callbacks") or {})
 
     @property
+    def is_short_test(self) -> bool:
+        """Return whether the run only tries all of its stages (`debug=fast`), with at most ten batches of training."""
+        batches, epochs = self.trainer.get("limit_train_batches"), self.trainer.get("max_epochs")
+        return isinstance(batches, int) and isinstance(epochs, int) and batches * epochs <= 10
+
+    @property
     def bounded_trainer(self) -> dict[str, Any]:
         """Return `trainer` with a validation interval of at most `max_epochs`, so that a short run is validated too."""
         every, epochs = self.trainer.get("check_val_every_n_epoch"), self.trainer.get("max_epochs")

@@ -13,6 +13,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+REPEATS, SHORT_TEST_REPEATS = 20, 3
+"""Number of timed calls of a prediction, in general and in a short test run (`Settings.is_short_test`)."""
+
 
 @dataclass(frozen=True)
 class Cost:
@@ -51,7 +54,7 @@ def measure(
     inputs: Tensor,
     *,
     parameters: int | None,
-    repeats: int = 20,
+    repeats: int = REPEATS,
     budget_seconds: float = 5.0,
 ) -> Cost:
     """Return the cost of `predict` on a batch of inputs.
@@ -111,7 +114,7 @@ def count_flops(call: Callable[[], object]) -> int:
 
 
 def wall_time(
-    call: Callable[[], object], device: torch.device, *, repeats: int = 20, budget_seconds: float = 5.0
+    call: Callable[[], object], device: torch.device, *, repeats: int = REPEATS, budget_seconds: float = 5.0
 ) -> float:
     """Return the median wall time of `call` in seconds, after two warm-up calls.
 

@@ -14,7 +14,7 @@ from framework.data import Batch
 from framework.density_head import Fitted
 from framework.distributions.noise import Draw
 from framework.errors import ConfigError
-from framework.evaluation.cost import Cost, measure
+from framework.evaluation.cost import REPEATS, Cost, measure
 from framework.model import Predictor
 from framework.prediction import Prediction, Split
 
@@ -190,7 +190,9 @@ def silence() -> Iterator[None]:
 
 
 @torch.no_grad()
-def cost(predictor: Predictor, batch: Batch, *, samples: int, device: torch.device) -> Cost:
+def cost(
+    predictor: Predictor, batch: Batch, *, samples: int, device: torch.device, repeats: int = REPEATS
+) -> Cost:
     """Return the cost of predicting the density and the point prediction for a batch.
 
     Args:
@@ -198,6 +200,7 @@ def cost(predictor: Predictor, batch: Batch, *, samples: int, device: torch.devi
         batch: the batch.
         samples: number of samples for a point prediction that has no closed form.
         device: device to predict on.
+        repeats: number of timed calls with the batch, and with one sample.
     """
     predictor.eval().to(device)
 
@@ -207,4 +210,4 @@ def cost(predictor: Predictor, batch: Batch, *, samples: int, device: torch.devi
     # A head that is fitted at once has no weights to count.
     fitted = any(isinstance(part, Fitted) for part in predictor.modules())
     parameters = None if fitted else sum(parameter.numel() for parameter in predictor.parameters())
-    return measure(predict, batch["input"].to(device), parameters=parameters)
+    return measure(predict, batch["input"].to(device), parameters=parameters, repeats=repeats)

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from framework.configuration.paths import shell_arguments
 from framework.errors import UserError
-from framework.evaluation.cost import Cost
+from framework.evaluation.cost import REPEATS, SHORT_TEST_REPEATS, Cost
 from framework.evaluation.splits import Evaluation, cost, evaluate
 from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, machine, results_table
 from framework.runs.provenance import package_versions
@@ -48,7 +48,13 @@ def report_test(run: Run, session: Session) -> None:
     )
     batch = next(iter(session.batches().test_dataloader()))
     note_idle_samples(session, batch)
-    run_cost = cost(session.predictor, batch, samples=settings.samples, device=session.device)
+    run_cost = cost(
+        session.predictor,
+        batch,
+        samples=settings.samples,
+        device=session.device,
+        repeats=SHORT_TEST_REPEATS if settings.is_short_test else REPEATS,
+    )
     columns = {key: heading for metric in metrics for key, heading in metric.columns.items()}
     better: Better = {**{key: way for metric in metrics for key, way in metric.better.items()}, **COST_BETTER}
     synthetic = data.synthetic or (outliers is not None and outliers.synthetic)
