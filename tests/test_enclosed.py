@@ -1,6 +1,7 @@
 """An entry of a run folder is opened only if it is a plain file of that folder."""
 
 import os
+import shutil
 import socket
 import subprocess
 from collections.abc import Callable
@@ -9,14 +10,21 @@ from pathlib import Path
 import pytest
 
 from framework.configuration.newest import newest_run
+from framework.configuration.registry import installed
+from framework.configuration.schema import build, resolve
+from framework.datasets.fields import fetch
 from framework.errors import CheckpointError, ConfigError, DataError
 from framework.storage.enclosed import (
     DEEPEST_FOLDERS,
+    FOLLOW_LINKS,
+    add_data_folder,
     open_plain,
     read_plain,
     require_enclosed,
     require_plain_within,
 )
+from framework.storage.reading import open_regular, read_bytes
+from framework.testing.contract import contract
 from framework.tracking import journal as journals
 from framework.tracking.journal import Journal
 
@@ -165,3 +173,84 @@ def test_a_line_with_a_place_that_is_no_number_is_damaged(line: str, tmp_path: P
     assert [record["n"] for record in journal.read()] == [1]
     assert journal.drop_after(0) == 0
     journal.close()
+
+
+FOLDERS = [
+    (name, number)
+    for name in installed("data")
+    for number, row in enumerate(contract("data", name).rows)
+    if row.write is not None
+]
+
+
+@pytest.mark.parametrize(("name", "number"), FOLDERS)
+def test_no_link_leads_out_of_a_data_folder(name: str, number: int, tmp_path: Path) -> None:
+    """Test links to files and links to folders, for all data sets whose contract row names a folder."""
+    row = contract("data", name).rows[number]
+    home, outside = tmp_path / "home", tmp_path / "outside"
+    home.mkdir()
+    settings = row.write(home)
+    config = resolve("data", {"name": name, **row.config, **settings})
+    if not any(Path(str(value)).is_dir() for value in settings.values()):
+        pytest.skip("the user names single files, which may be links")
+    home.rename(outside)
+    for linked in ("files", "folders"):
+        home.mkdir()
+        for path in sorted(outside.iterdir()):
+            if linked == "folders" or path.is_file():
+                (home / path.name).symlink_to(path)
+                continue
+            for file in sorted(path.rglob("*")):
+                target = home / file.relative_to(outside)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                if file.is_dir():
+                    target.mkdir(exist_ok=True)
+                else:
+                    target.symlink_to(file)
+        with pytest.raises(DataError, match=f"is reached by a link .* {FOLLOW_LINKS}=1"):
+            data = build("data", config)
+            data.prepare()
+            fetch(data.splits().train, [0])
+        shutil.rmtree(home)
+
+
+def test_links_within_a_data_folder_and_links_of_the_user_are_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "disk" / "all").mkdir(parents=True)
+    (tmp_path / "disk" / "all" / "a.txt").write_text("a")
+    (tmp_path / "disk" / "b.txt").symlink_to("all/a.txt")
+    (tmp_path / "disk" / "some").symlink_to("all")
+    (tmp_path / "disk" / "out.txt").symlink_to(tmp_path / "out.txt")
+    (tmp_path / "out.txt").write_text("out")
+    (tmp_path / "data").symlink_to("disk")
+    add_data_folder(tmp_path / "data")
+    for name in ("all/a.txt", "b.txt", "some/a.txt", "../data/some/a.txt"):
+        assert read_bytes(tmp_path / "data" / name) == b"a"
+    with pytest.raises(DataError, match=r"out\.txt is reached by a link"):
+        read_bytes(tmp_path / "data" / "out.txt")
+    assert read_bytes(tmp_path / "disk" / "out.txt") == b"out", "the user names this path"
+    monkeypatch.setenv(FOLLOW_LINKS, "1")
+    assert read_bytes(tmp_path / "data" / "out.txt") == b"out"
+    monkeypatch.delenv(FOLLOW_LINKS)
+    add_data_folder(tmp_path)  # all of the link's target lies in a folder that the user names
+    assert read_bytes(tmp_path / "data" / "out.txt") == b"out"
+
+
+def test_a_sparse_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    """Refuse a terabyte of zeros with a few bytes at the beginning, in the middle or at the end; read a small file."""
+    file = tmp_path / "one.x"
+    for place in (0, 2**36, 2**40 - 9):
+        with file.open("wb") as stream:
+            stream.seek(place)
+            stream.write(b"content")
+            stream.truncate(2**40)
+        with pytest.raises(
+            ValueError, match=r"sparse: of its 1099511627776 bytes only \d+ are stored.*`cp --sparse"
+        ):
+            open_regular(file)
+    with file.open("wb") as stream:
+        stream.write(bytes(2**20))
+        stream.truncate(2**20 * 18)
+    with open_regular(file) as stream:
+        assert stream.read(3) == b"\0\0\0"

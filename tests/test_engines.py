@@ -176,6 +176,25 @@ def test_a_job_is_lost_if_slurm_says_so_and_the_job_did_not_end_by_itself(
     assert process.lost == (lost and code != 1)
 
 
+def test_no_batch_file_that_lies_in_the_folder_of_a_sweep_is_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A node unpickles what lies under the name of its job in this folder, before submitit has moved the job there."""
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "srun").write_text("#!/bin/sh")
+    (tmp_path / "bin" / "srun").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"), prepend=os.pathsep)
+    planted = tmp_path / slurm_engine.SUBMITTED
+    planted.mkdir()
+    for number in range(9):
+        (planted / f"{number}_submitted.pkl").write_bytes(b"code")
+    settings = slurm_engine.SlurmSettings()
+    folders = [Path(slurm_engine.Slurm(tmp_path, settings)._executor.folder) for _ in range(2)]
+    for folder in folders:
+        assert folder.parent == planted and not list(folder.glob("*.pkl"))
+    assert folders[0] != folders[1]
+
+
 @pytest.mark.slow
 def test_a_job_at_its_time_limit_is_queued_again_and_goes_on(app: App, slurm: SlurmCluster) -> None:
     process = app.start("-m", app.chosen, "what=hold")

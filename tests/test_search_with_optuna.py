@@ -157,6 +157,53 @@ def test_a_study_of_another_search_is_refused_and_a_damaged_one_too(tmp_path: Pa
         study(tmp_path)
 
 
+NONSENSE = [None, -1, 10**400, 1e308, math.nan, "x", [], {}, [1], {"a": 1}, True]
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_a_study_of_somebody_else_gets_a_sentence(sampler: str, tmp_path: Path) -> None:
+    """Replace each value of each kind of line by one of another kind; the search goes on, or says a sentence."""
+    one = study(tmp_path, sampler=sampler)
+    objectives = 2 if sampler == "nsga2" else 1
+    one.store_ways(["minimize"] * objectives)
+    for _ in range(4):
+        tell(one, one.suggest(1, 9)[0], objectives)
+    one.suggest(1, 9)
+    lines = [json.loads(line) for line in (tmp_path / FILE).read_text().splitlines()]
+    places = {}
+    for number, line in enumerate(lines):
+        for key, value in line.items():
+            inside = (
+                list(value)
+                if isinstance(value, dict)
+                else range(len(value))
+                if isinstance(value, list)
+                else ()
+            )
+            places |= {(line["op_code"], key, inner): (number, key, inner) for inner in (None, *inside)}
+    outcomes = Counter[str]()
+    for turn, (number, key, inner) in enumerate(places.values()):
+        changed = json.loads(json.dumps(lines))
+        for value in (NONSENSE[turn % len(NONSENSE)], NONSENSE[(7 * turn + 3) % len(NONSENSE)]):
+            if inner is None:
+                changed[number][key] = value
+            else:
+                changed[number][key][inner] = value
+            (tmp_path / FILE).write_text("".join(f"{json.dumps(line)}\n" for line in changed))
+            try:
+                again = study(tmp_path, sampler=sampler)
+                assert len(again.ways) == objectives
+                again.take_up(lambda overrides: False)
+                for overrides in again.suggest(2, 12):
+                    tell(again, overrides, objectives)
+                again.take_over()
+                outcomes["went on"] += 1
+            except (ConfigError, DataError) as error:
+                assert "study" in str(error) and len(str(error)) < 1000
+                outcomes["sentence"] += 1
+    assert min(outcomes["went on"], outcomes["sentence"]) > 3, outcomes
+
+
 @pytest.mark.parametrize(
     ("address", "message"),
     [

@@ -108,7 +108,7 @@ def remove_paths(
             if (
                 part.key.partition(".")[0] in MODEL
                 and name not in paths
-                and not _is_marked_path(part.annotation(name))
+                and not is_marked_path(part.annotation(name))
             ):
                 raise ConfigError(
                     f"{shorten(key)} = {quote(user_values[key])} would change a trained model. A command may override "
@@ -302,7 +302,8 @@ def holds_path(annotation: Any, value: Any) -> bool:
     return False
 
 
-def _is_marked_path(annotation: Any) -> bool:
+def is_marked_path(annotation: Any) -> bool:
+    """Return whether the annotation of a parameter says that its text names a file or folder."""
     return bool(_path_mark(annotation))
 
 

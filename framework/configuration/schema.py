@@ -29,9 +29,11 @@ from uuid import UUID
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 from pydantic_core import to_jsonable_python
 
+from framework.configuration.paths import is_marked_path
 from framework.configuration.registry import load
 from framework.configuration.signature import arguments, parts, positional, signature
 from framework.errors import ConfigError, did_you_mean, list_names, quote, shorten
+from framework.storage.enclosed import add_data_folder
 from framework.storage.plain_values import is_number
 
 WRITTEN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
@@ -126,6 +128,9 @@ def build(group: str, config: Mapping[str, Any], **context: Any) -> Any:
         supplied.append(context[parameter.name])
     stored = _defaults(cls) | {key: value for key, value in config.items() if key != "name"}
     values = _validate(cls, _to_plain_values(cls, stored, group), group, nullable=True)
+    for name, value in values.items():
+        if isinstance(value, str) and is_marked_path(signature(cls)[name][0]):
+            add_data_folder(value)
     for key, part in parts(cls).items():
         if values[key] is None:
             continue

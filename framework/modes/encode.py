@@ -29,7 +29,7 @@ from framework.runs.job import refuse_idle
 from framework.runs.run import open_run
 from framework.runs.session import record_citations, set_up_process
 from framework.runs.user_files import UNREADABLE, select_files
-from framework.storage.enclosed import require_enclosed
+from framework.storage.enclosed import add_data_folder, require_enclosed
 from framework.storage.files import remove_leftovers, replacing, write_whole
 from framework.storage.names import spell_name
 from framework.storage.plain_values import read_json
@@ -157,6 +157,7 @@ def run(config: Config) -> None:
     options = config.options(EncodeOptions)
     console = set_up_process(config.settings)
     root, into = Path(options.files).expanduser(), Path(options.into).expanduser()
+    add_data_folder(root)
     shards = open_shards(root) if is_folder_of_shards(root) else None
     parts = {
         "data": resolve("data", config.settings.data or {}) if shards is None else data_of(shards, config),

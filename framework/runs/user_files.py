@@ -8,6 +8,7 @@ from rich.console import Console
 
 from framework.data import Data
 from framework.errors import DataError
+from framework.storage.enclosed import add_data_folder
 from framework.storage.names import spell_name
 from framework.storage.progress import track_progress
 
@@ -27,6 +28,7 @@ def list_files(path: Path) -> tuple[list[Path], list[Path]]:
         raise DataError(f"mode.files={path} does not exist. Give a file, or a folder of files.")
     if path.is_file():
         return [path], []
+    add_data_folder(path)
     items = sorted(item for item in path.iterdir() if not item.name.startswith("."))
     files = [item for item in items if item.is_file()]
     folders = [item for item in items if item.is_dir()]

@@ -21,6 +21,7 @@ from framework.scenes import turntable
 from framework.scenes.parts import Axis, Subject
 from framework.scenes.pictures import Stage, prepare_stage
 from framework.scenes.scene_files import UPWARDS, read
+from framework.storage.enclosed import add_data_folder
 from framework.storage.reading import translate_errors
 
 
@@ -156,6 +157,7 @@ def find_scene_files(path: Path) -> list[Path]:
     """
     if not path.is_dir():
         return [path]
+    add_data_folder(path)
     files = sorted(file for file in path.iterdir() if file.suffix.lower() in UPWARDS and file.is_file())
     if not files:
         raise DataError(

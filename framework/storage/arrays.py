@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from framework.errors import shorten
 from framework.storage.enclosed import read_stream
-from framework.storage.reading import most_decompressed
+from framework.storage.reading import most_decompressed, require_stored
 
 MAGIC = b"\x93NUMPY"
 HEADERS = {(1, 0): layout.read_array_header_1_0, (2, 0): layout.read_array_header_2_0}
@@ -46,11 +46,12 @@ def map_npy(path: Path) -> NDArray:
     be shortened while the array is in use.
 
     Raises:
-        ValueError: The file is no .npy file, is damaged, or contains Python objects or records.
+        ValueError: The file is no .npy file, is damaged or sparse, or contains Python objects or records.
         DataError: The file is a link or no regular file (`framework.storage.enclosed`).
         OSError: The file cannot be opened.
     """
     with read_stream(path) as stream:
+        require_stored(stream.fileno())
         shape, order, kind = _read_header(stream, os.fstat(stream.fileno()).st_size)
         count, start = math.prod(shape), stream.tell()
         if not count:

@@ -8,6 +8,7 @@ checks other paths with `require_plain_within`.
 
 import os
 import stat
+from functools import lru_cache
 from pathlib import Path
 from typing import BinaryIO
 
@@ -86,6 +87,47 @@ def require_plain_within(file: Path, folder: Path, error: type[UserError] = Data
             return
         if fault := _fault(status):
             raise error(f"{shorten(path)} is {fault}. {REMEDY}")
+
+
+FOLLOW_LINKS = "FRAMEWORK_FOLLOW_LINKS"
+"""Environment variable with which a user allows links in data folders to lead to any other folder."""
+_data_folders: set[str] = set()
+
+
+def add_data_folder(path: str | os.PathLike[str]) -> None:
+    """Let `require_inside_data` refuse the links of a folder that the user names for reading data; ignore a file."""
+    folder = os.path.abspath(os.path.expanduser(path))  # noqa: PTH100, PTH111
+    if os.path.isdir(folder):  # noqa: PTH112
+        _data_folders.add(folder)
+
+
+def require_inside_data(file: str | os.PathLike[str]) -> None:
+    """Refuse a file of a data folder that is reached by a link out of the folder; accept any other file.
+
+    A folder from another person could contain a link to a private image, which the figures of a run would show. The
+    data folder itself may be a link, because its name comes from the user.
+
+    Raises:
+        DataError: The file is reached by such a link.
+    """
+    path = os.path.abspath(file)  # noqa: PTH100
+    homes = [folder for folder in _data_folders if path.startswith(folder.rstrip(os.sep) + os.sep)]
+    if not homes or os.environ.get(FOLLOW_LINKS) == "1":
+        return
+    parent, name = os.path.split(path)
+    real = os.path.realpath(path) if os.path.islink(path) else os.path.join(_real_folder(parent), name)  # noqa: PTH114, PTH118
+    if not any(real.startswith(_real_folder(home).rstrip(os.sep) + os.sep) for home in homes):
+        raise DataError(
+            f"{shorten(path)} is reached by a link that leads out of the folder {shorten(max(homes, key=len))}. The "
+            "folder may come from an untrusted source, so such links are not followed. Replace the link by a copy or "
+            f"a hard link or, if all links in the folder are your own, set the environment variable {FOLLOW_LINKS}=1."
+        )
+
+
+@lru_cache(maxsize=4096)
+def _real_folder(folder: str) -> str:
+    """Return the path of a folder without links; most files share their folder with others."""
+    return os.path.realpath(folder)
 
 
 def open_plain(path: Path, flags: int) -> int:

@@ -43,7 +43,10 @@ MOST_DRAWN = 2**26
 # compressed files
 
 UNFOLDED_BYTES, UNFOLDED_TIMES = 2**27, 20
-"""A compressed file may decompress to UNFOLDED_BYTES or UNFOLDED_TIMES × its own size, whichever is larger."""
+"""A compressed file may decompress to UNFOLDED_BYTES or UNFOLDED_TIMES × its own size, whichever is larger.
+
+The same holds for a sparse file, most of whose bytes are not stored and read as zeros.
+"""
 
 # images
 
@@ -59,6 +62,12 @@ MOST_SCANS = 100
 """Largest number of scans of a JPEG image, as in libtiff (LIBTIFF_JPEG_MAX_ALLOWED_SCAN_NUMBER); programs write ten.
 
 A scan of a hundred bytes can pass over every pixel of the image, which takes milliseconds.
+"""
+FEW_IMAGES, BYTES_PER_IMAGE = 100_000, 16
+"""Number of images that a small idx file may hold, and least number of bytes of the file for each further image.
+
+An image takes some hundred bytes in memory, however few pixels it has. An image of MNIST takes about 160 bytes of its
+packed file.
 """
 MOST_PADDED = 2**26
 """Largest number of pixels of an image padded to a square; a larger one is scaled down before the padding."""

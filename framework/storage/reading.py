@@ -4,6 +4,7 @@ Only regular files are read. The size to which a file may decompress is limited 
 and the limit is checked before anything is allocated.
 """
 
+import errno
 import io
 import os
 import stat
@@ -14,6 +15,7 @@ from pathlib import Path
 
 from framework.errors import DataError, UserError, shorten
 from framework.storage import limits
+from framework.storage.enclosed import require_inside_data
 
 RESTORE = "Copy the file again from its source."
 SMALL, MOST_TIMES = limits.UNFOLDED_BYTES, limits.UNFOLDED_TIMES
@@ -54,12 +56,49 @@ def open_regular(file: Path) -> "Bounded":
 
     Raises:
         OSError: The file is missing or is not a regular file. Reading a pipe or a device might never end.
+        ValueError: The file is sparse, and has far more bytes than are stored.
+        DataError: The file is reached by a link that leads out of a data folder.
     """
+    require_inside_data(file)
     stream = Bounded(io.FileIO(file, "rb", opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)))
-    if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+    try:
+        if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+            raise OSError("the path is not a regular file")
+        require_stored(stream.fileno())
+    except BaseException:
         stream.close()
-        raise OSError("the path is not a regular file")
+        raise
     return stream
+
+
+def require_stored(descriptor: int) -> None:
+    """Refuse an open file that is sparse and has far more bytes than are stored.
+
+    An archive of a kilobyte can contain a sparse file of a terabyte, which takes no place on the disk. Reading it would
+    take a terabyte of memory.
+
+    Raises:
+        ValueError: The file has more than `most_decompressed` bytes for those that are stored.
+    """
+    status = os.fstat(descriptor)
+    if status.st_size <= most_decompressed(512 * status.st_blocks):
+        return
+    stored, end, position = 0, 0, os.lseek(descriptor, 0, os.SEEK_CUR)
+    try:
+        # `st_blocks` alone is not enough: some network file systems leave it 0, and report a file without holes
+        while status.st_size > most_decompressed(stored):
+            start = os.lseek(descriptor, end, os.SEEK_DATA)
+            end = os.lseek(descriptor, start, os.SEEK_HOLE)
+            stored += end - start
+    except OSError as error:
+        if error.errno != errno.ENXIO:  # the file system does not tell; ENXIO: no data follow
+            return
+        raise ValueError(
+            f"the file is sparse: of its {status.st_size} bytes only {stored} are stored, but at least one in "
+            f"{MOST_TIMES} is required. Copy it with `cp --sparse=never` if its zeros are meant"
+        ) from None
+    finally:
+        os.lseek(descriptor, position, os.SEEK_SET)
 
 
 class Bounded(io.BufferedReader):

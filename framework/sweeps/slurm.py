@@ -8,6 +8,7 @@ while. This module asks `squeue` and not `sacct`, because many clusters have no 
 import getpass
 import logging
 import math
+import secrets
 import shutil
 import signal
 import subprocess
@@ -26,7 +27,12 @@ from framework.sweeps.engines import Process, require_module
 from framework.sweeps.node import STOP, NodeJob, read_node
 
 SUBMITTED = ".slurm"
-"""Folder, in the folder of the sweep, with the batch files of the jobs and the output of SLURM and submitit."""
+"""Folder, in the folder of the sweep, with a folder for each command that submitted jobs.
+
+Such a folder holds the batch files of the jobs and the output of SLURM and submitit. Its name is random: a node
+unpickles the job from a file that submitit names by the job's number, and the folder of a sweep that another person
+sent may hold files with such names.
+"""
 _ENDED = {
     **dict.fromkeys(("COMPLETED", "CANCELLED", "FAILED", "OUT_OF_MEMORY", "DEADLINE"), 2.0),
     **dict.fromkeys(("TIMEOUT", "NODE_FAIL", "PREEMPTED", "BOOT_FAIL", "REVOKED"), 10.0),
@@ -91,10 +97,10 @@ class Slurm:
 
     def __init__(self, folder: Path, settings: SlurmSettings) -> None:
         self.threads = settings.cpus
-        self._folder = folder
+        self._submitted = folder / SUBMITTED / secrets.token_hex(8)
         from submitit import SlurmExecutor
 
-        self._executor = SlurmExecutor(folder / SUBMITTED, max_num_timeout=settings.requeues)
+        self._executor = SlurmExecutor(self._submitted, max_num_timeout=settings.requeues)
         self._parameters: dict[str, Any] = {
             "time": settings.time,
             "nodes": settings.nodes,
@@ -123,7 +129,7 @@ class Slurm:
             job = self._executor.submit(NodeJob(command, environment, str(folder), str(Path.cwd())))
         except (FailedJobError, FailedSubmissionError) as error:
             raise UserError(f"SLURM refuses the job: {shorten(' '.join(str(error).split()))}") from error
-        for link in (self._folder / SUBMITTED).glob(".submission_file_*"):
+        for link in self._submitted.glob(".submission_file_*"):
             link.unlink()  # a link to the batch file; a folder of runs that contains links is refused
         return SlurmProcess(f"slurm:{job.job_id}", folder, submitted=True)
 

@@ -27,7 +27,7 @@ from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 
-from framework.errors import ConfigError, shorten
+from framework.errors import ConfigError, UserError, shorten
 from framework.runs.job import PRUNED
 from framework.storage.files import hold_lock, write_whole
 from framework.storage.reading import translate_errors
@@ -37,6 +37,8 @@ from framework.tracking.stores import require_no_password, without_password
 from hydra_plugins.framework_search._space import Choice, Domain, overrides_of
 
 FILE, LOCK = "study.jsonl", ".study.lock"
+REMEDY = "Delete the file and repeat the command; jobs that have completed do not run again."
+"""Advice for a damaged file of a study."""
 REPEATS = 100
 """Number of consecutive suggestions that only repeat earlier trials, after which a search counts as converged."""
 INTERVAL = 0.5
@@ -169,8 +171,11 @@ class Study:
     def ways(self) -> list[str | None]:
         """Return the direction of each metric, "minimize" or "maximize"; None for each metric before `store_ways`."""
         with self._reached():
-            stored = self._study.user_attrs.get(WAYS)
-        return stored or [None] * len(self._study.directions)
+            stored = self._study.user_attrs.get(WAYS, [None] * len(self._study.directions))
+            known = {"minimize", "maximize", None}
+            if len(stored) != len(self._study.directions) or not known.issuperset(stored):
+                raise ValueError(f"the directions of the metrics are {shorten(stored)}")
+        return stored
 
     def store_ways(self, ways: Sequence[str]) -> None:
         """Store the direction of each metric, "minimize" or "maximize".
@@ -215,19 +220,18 @@ class Study:
         """Return the points of all trials, in the order in which they were suggested first."""
         points: dict[tuple[str, ...], Point] = {}
         with self._reached():
-            trials = self._study.get_trials(deepcopy=False)
-        for trial in trials:
-            params = trial.params or trial.system_attrs.get("fixed_params", {})
-            if set(params) != set(self._distributions):
-                continue  # another command draws the values of this trial, or was killed before it had all
-            overrides = self._overrides(params)
-            complete = trial.state == TrialState.COMPLETE
-            values: list[float] = list(trial.values or ()) if complete else []
-            point = Point(overrides, params, trial.number, trial.state, values, self._is_here(trial))
-            earlier = points.setdefault(tuple(overrides), point)
-            if _INFORMATIVE.index(trial.state) > _INFORMATIVE.index(earlier.state):
-                earlier.state, earlier.values = trial.state, values
-            earlier.is_own = earlier.is_own or point.is_own
+            for trial in self._study.get_trials(deepcopy=False):
+                params = trial.params or trial.system_attrs.get("fixed_params", {})
+                if set(params) != set(self._distributions):
+                    continue  # another command draws the values of this trial, or was killed before it had all
+                overrides = self._overrides(params)
+                complete = trial.state == TrialState.COMPLETE
+                values: list[float] = list(trial.values or ()) if complete else []
+                point = Point(overrides, params, trial.number, trial.state, values, self._is_here(trial))
+                earlier = points.setdefault(tuple(overrides), point)
+                if _INFORMATIVE.index(trial.state) > _INFORMATIVE.index(earlier.state):
+                    earlier.state, earlier.values = trial.state, values
+                earlier.is_own = earlier.is_own or point.is_own
         return list(points.values())
 
     def suggest(self, count: int, trials: int) -> list[list[str]]:
@@ -365,13 +369,20 @@ class Study:
 
     @contextmanager
     def _reached(self) -> Iterator[None]:
-        """Convert the errors of a database that cannot be reached to an error with a sentence."""
+        """Convert the errors of a file from an untrusted source, or of a database that cannot be reached."""
         from sqlalchemy.exc import SQLAlchemyError
 
         try:
             yield
+        except (UserError, OSError):  # the disk may be full
+            raise
         except (optuna.exceptions.StorageInternalError, SQLAlchemyError) as error:
             raise _unreachable(self.storage or "", error) from error
+        except Exception:
+            if self.storage is not None:
+                raise
+            with translate_errors(self.folder / FILE, "a study of Optuna", REMEDY):
+                raise
 
 
 class SeededSampler(BaseSampler):
@@ -459,8 +470,7 @@ class _FileLock(JournalFileOpenLock):
 
 def _open_file(folder: Path) -> BaseStorage:
     path = folder / FILE
-    remedy = "Delete the file and repeat the command; jobs that have completed do not run again."
-    with translate_errors(path, "a study of Optuna", remedy):
+    with translate_errors(path, "a study of Optuna", REMEDY):
         return JournalStorage(JournalFileBackend(str(path), lock_obj=_FileLock(path)))
 
 

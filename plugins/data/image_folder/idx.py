@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from framework.errors import DataError
+from framework.storage.limits import BYTES_PER_IMAGE, FEW_IMAGES
 from framework.storage.reading import inflate, most_decompressed, read_bytes, translate_errors
 
 NAME = re.compile(r"(?P<start>.*)(images(?P<sign>[-.])idx3|labels(?P<other>[-.])idx1)-ubyte(\.gz)?")
@@ -98,5 +99,10 @@ def read_idx(file: Path, dimensions: int) -> UInt8[np.ndarray, "..."]:
         if math.prod(shape) != len(content) - start:
             raise ValueError(
                 f"the header states {' × '.join(map(str, shape))} values, but {len(content) - start} values follow"
+            )
+        size = file.stat().st_size
+        if dimensions == 3 and shape[0] > (most := max(FEW_IMAGES, size // BYTES_PER_IMAGE)):
+            raise ValueError(
+                f"the header states {shape[0]} images, but a file of {size} bytes may hold at most {most}"
             )
         return np.frombuffer(content, np.uint8, offset=start).reshape(shape)
