@@ -5,6 +5,7 @@ Prints a line of JSON for each: what it was, how it ended, processor seconds and
 """
 
 import copy
+import gzip
 import io
 import json
 import math
@@ -29,6 +30,7 @@ from PIL import Image
 
 import framework
 from framework.configuration.assembly import build_predictor
+from framework.configuration.composition import in_quotes
 from framework.configuration.loading import PREFIX
 from framework.configuration.registry import installed
 from framework.configuration.schema import build, resolve
@@ -36,12 +38,15 @@ from framework.datasets.csv_columns import read_columns
 from framework.datasets.images import Crop
 from framework.density_head import Fitted
 from framework.distributions.protocol import median
-from framework.errors import UserError
+from framework.errors import UserError, shorten
 from framework.geometry import meshes
 from framework.model import fitted_models
-from framework.storage import checkpoints
+from framework.storage import checkpoints, text
+from framework.storage.arrays import map_npy
+from framework.storage.names import spell_name
 from framework.target import Target
 from framework.testing.contract import contract
+from framework.tracking.stores import require_no_password, without_password
 from tests.fuzz.crafted_files import plain_png
 
 HUGE = (20_000, 30_000_000)
@@ -51,7 +56,7 @@ REALS = Target("real", ("x", "y"))
 SECONDS = 10.0
 """Limit of the processor time of one case, seconds."""
 MUCH = 450.0
-"""Peak memory after which the next case runs in another process, megabytes."""
+"""Memory that a case leaves behind, after which the next case runs in another process, megabytes."""
 Case = tuple[str, Callable[[], object], Callable[[], object]]
 """Name of a case, what prepares it and does not count, and what is measured."""
 
@@ -64,8 +69,9 @@ def case(name: str, action: Callable[[], object]) -> None:
 def cases(pending: Sequence[Case]) -> None:
     """Run functions one after another in a fork, and print the outcome of each.
 
-    A fork of this large process costs more than most functions. The remaining functions run in another fork after one
-    that was killed, and after one that took much memory, so that the peak of each is its own.
+    A fork of this large process costs more than most functions. The peak of the memory is reset before each function,
+    so that it is the function's own. The remaining functions run in another fork after one that was killed, and after
+    one that left much memory behind.
     """
     while pending:
         reading, writing = os.pipe()
@@ -76,7 +82,7 @@ def cases(pending: Sequence[Case]) -> None:
                     prepare()
                     line = outcome(name, action)
                     os.write(writing, json.dumps(line).encode() + b"\n")
-                    if line["megabytes"] > MUCH:
+                    if megabytes("VmRSS") > MUCH:
                         break
             finally:
                 os._exit(0)
@@ -85,9 +91,9 @@ def cases(pending: Sequence[Case]) -> None:
             lines = stream.read().decode().splitlines()
         _, status, used = os.wait4(child, 0)
         if len(lines) < len(pending) and (status != 0 or not lines):
-            seconds, megabytes = used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
+            seconds, peak = used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
             name = pending[len(lines)][0]
-            killed = {"case": name, "ended": "killed", "seconds": seconds, "megabytes": megabytes}
+            killed = {"case": name, "ended": "killed", "seconds": seconds, "megabytes": peak}
             lines.append(json.dumps(killed))
         sys.stdout.write("".join(f"{line}\n" for line in lines))
         sys.stdout.flush()
@@ -95,7 +101,8 @@ def cases(pending: Sequence[Case]) -> None:
 
 
 def outcome(name: str, action: Callable[[], object]) -> dict[str, Any]:
-    """Run a function, and return how it ended, its processor time and the peak memory of this process."""
+    """Run a function, and return how it ended, its processor time and the peak memory of this process meanwhile."""
+    Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM (proc_pid_clear_refs(5))
     before = processor_seconds()
     signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:
@@ -106,9 +113,14 @@ def outcome(name: str, action: Callable[[], object]) -> dict[str, Any]:
     except BaseException as error:
         ended = f"raised: {type(error).__name__}: {error}"
     signal.setitimer(signal.ITIMER_PROF, 0)
-    megabytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     seconds = processor_seconds() - before
-    return {"case": name, "ended": ended[:2000], "seconds": seconds, "megabytes": megabytes}
+    return {"case": name, "ended": ended[:2000], "seconds": seconds, "megabytes": megabytes("VmHWM")}
+
+
+def megabytes(entry: str) -> float:
+    """Return the memory of this process: "VmRSS" now, or "VmHWM" at its peak since the peak was reset."""
+    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith(f"{entry}:"))
 
 
 def processor_seconds() -> float:
@@ -306,6 +318,12 @@ def matlab(name: bytes, shape: tuple[int, int], content: bytes) -> bytes:
     return struct.pack("<II", 15, len(packed)) + packed
 
 
+def idx(*shape: int) -> bytes:
+    """Return a packed idx file of zeros."""
+    header = bytes([0, 0, 8, len(shape)]) + b"".join(side.to_bytes(4, "big") for side in shape)
+    return gzip.compress(header + bytes(math.prod(shape)), 1)
+
+
 def scene(count: int, mode: int = 4, nodes: int = 1, sets: int = 0) -> bytes:
     """Return a glTF file whose accessors have no data, so that all their numbers are 0."""
     accessors = [{"componentType": 5121, "count": count, "type": kind} for kind in ("VEC3", "SCALAR", "VEC4")]
@@ -401,6 +419,7 @@ def bombs() -> dict[str, tuple[Callable[[], bytes], Callable[[Path], object]]]:
     from framework.bodies import body_files, motion
     from framework.scenes import scene_files
     from plugins.data.cest.volumes import read_volume
+    from plugins.data.image_folder.labelled import LabelledImages
 
     def shown(file: Path) -> object:
         return Crop(file, None, 0.1, 64, 3, upright=True).read()
@@ -429,6 +448,11 @@ def bombs() -> dict[str, tuple[Callable[[], bytes], Callable[[Path], object]]]:
         "tiles larger than the image.tif": (lambda: tiled(32_768), shown),
         "many scans.jpg": (lambda: scanned(8000), shown),
         "a GIF.gif": (lambda: image("P", (side, side), "GIF"), shown),
+        "no marker.jpg": (lambda: b"\xff\xd8" + b"\xff" * 4_000_000, shown),
+        "pixels/images-idx3-ubyte.gz": (
+            lambda: idx(bytes_in_all, 1, 1),
+            lambda file: LabelledImages().list_images(file.parent, 2),
+        ),
         "points.npz": (
             lambda: archive(points=array((bytes_in_all // 3, 3), "|u1", ones()[: bytes_in_all // 3 * 3])),
             meshes.read,
@@ -479,17 +503,72 @@ def files(folder: Path) -> None:
     if writer == 0:
         try:
             for name, (write, _) in bombs().items():
+                (folder / name).parent.mkdir(exist_ok=True)
                 (folder / name).write_bytes(write())
+            (folder / "pixels" / "labels-idx1-ubyte.gz").write_bytes(idx(2**27 - 4096))
+            for name in SPARSE:
+                with (folder / name).open("wb") as stream:
+                    stream.write(array((2**31,), "|u1", b""))
+                    stream.truncate(2**32)
         finally:
             os._exit(0)
     os.waitpid(writer, 0)
     for name, (_, read) in bombs().items():
         assert 0 < (folder / name).stat().st_size < 10_000_000, name
         case(name, partial(read, folder / name))
+    for name, read in SPARSE.items():
+        case(name, partial(read, folder / name))
+
+
+SPARSE: dict[str, Callable[[Path], object]] = {
+    "a sparse array.npy": meshes.read,
+    "a sparse table.csv": read_columns,
+    "a sparse shard.npy": lambda file: map_npy(file).sum(),
+}
+"""Files of 4 GB of which 4 kB are stored, as an archive can contain them."""
+
+
+def texts(folder: Path) -> None:
+    """Give long texts to each function that searches the text of another person by a regular expression."""
+    count = 300_000
+    for function, patterns in {
+        text.defuse_formulas: ("\n", "\r\n ", " ", "=(", ";"),
+        text.trim: (" \u200b", "\u200b \u200b "),
+        text.suggest_number: ("1,", "1 "),
+        text.words_of: ("\xa0 ",),
+        without_password: ("://", "://:", "://a:b@", "?", "?pass", "&pass=", "?a=", "@"),
+        require_no_password: ("://", "http://", "?pass"),
+        in_quotes: ("\\", "'", "\\'", "\\x"),
+        spell_name: ("\\x", "\x1b"),
+        shorten: ("\n", "\x1b"),
+    }.items():
+        for pattern in patterns:
+            for ending in ("", "x", "\n"):
+                name = f"{function.__name__} of {pattern!r} and {ending!r}"
+                case(name, partial(function, pattern * count + ending))
+    for pattern in (
+        b"\n",
+        b" ",
+        b"//",
+        b"1,",
+        b" ,",
+        b"\\\n",
+        b"\\ ",
+        b'"1',
+        b"#",
+        b"end_header\t",
+        b"\nend_header ",
+    ):
+        for kind in ("xyz", "obj", "off", "ply"):
+            file = folder / f"a.{kind}"
+            file.write_bytes((b"ply\n" if kind == "ply" else b"") + pattern * count)
+            case(f"{kind} of {pattern!r}", partial(meshes.read, file))
 
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
     resource.setrlimit(resource.RLIMIT_AS, (2**33, 2**33))
     with TemporaryDirectory() as place:
-        {"parameters": stored_parameters, "fields": stored_fields, "files": files}[sys.argv[1]](Path(place))
+        {"parameters": stored_parameters, "fields": stored_fields, "files": files, "texts": texts}[
+            sys.argv[1]
+        ](Path(place))

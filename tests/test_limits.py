@@ -21,10 +21,12 @@ ROOT = Path(__file__).parent.parent
 
 
 @pytest.mark.slow  # each case is a process, and there are 300
-@pytest.mark.parametrize(("what", "least"), [("parameters", 250), ("fields", 15), ("files", 25)])
+@pytest.mark.parametrize(
+    ("what", "least"), [("parameters", 250), ("fields", 15), ("files", 30), ("texts", 100)]
+)
 def test_nothing_small_takes_much(what: str, least: int) -> None:
-    """Test every number of every plugin's config, other descriptions in a checkpoint, and compressed files of every
-    reader."""
+    """Test every number of every plugin's config, other descriptions in a checkpoint, compressed and sparse files of
+    every reader, and long texts."""
     quiet = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, "-m", "tests.exhausting", what],

@@ -21,7 +21,7 @@ from framework.reports.page import PNG
 from framework.sweeps.pages import LARGEST_FIGURE, write_report
 from tests.conftest import TINY, Framework
 
-EVIL = '<script src="https://example.org/x.js">alert(1)</script>&"\'{}\\_%$#~^\x1b[31m'
+EVIL = '<script src="https://example.org/x.js">alert(1)</script>&"\'{}\\_%$#~^\x1b[31m\u202e'
 HEADINGS = {"nll": "NLL (nats)", "accuracy": "accuracy"}
 
 
@@ -138,6 +138,7 @@ def test_a_page_loads_nothing_and_runs_nothing_of_a_stranger(tmp_path: Path) -> 
     assert "default-src 'none'" in page
     assert "onload" not in page
     assert "\x1b" not in page + latex
+    assert "\N{RIGHT-TO-LEFT OVERRIDE}" not in page and "\\u202e" in page
 
 
 def test_a_link_in_the_folder_is_refused(tmp_path: Path) -> None:

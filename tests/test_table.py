@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 from rich.console import Console
 
+from framework.deployment.exported_folder.predict import plain_text
 from framework.errors import ConfigError
 from framework.reports.table import (
     WIDTH,
@@ -27,6 +28,7 @@ from framework.reports.table import (
     results_table,
     write_csv,
 )
+from framework.storage.text import trim
 
 COLUMNS = {"method": "method", "log_likelihood": "log-likelihood nats", "maad_deg": "MAAD °"}
 ROWS = [
@@ -216,6 +218,10 @@ FORMULAS = [
     "@SUM(1)",
     "\t=A(1)",
     "a;=cmd|' /C calc'!A0",
+    "\ufeff=A(1)",
+    "\u200b =A(1)",
+    "＝A(1)",
+    "＠SUM(1)",
 ]
 
 
@@ -227,9 +233,9 @@ def test_a_name_is_no_formula_of_a_spreadsheet(formula: str, tmp_path: Path) -> 
     text = path.read_text()
     header, row = reader.reader(text.splitlines())
     assert row[1:] == ["-0.5", "-ve", "+ve", "a-b (c)"]
-    for name in (row[0], header[1]):
-        assert name.replace("'", "") == formula.replace("'", "") and name != formula
-        assert not any(part.strip()[:1] in "=+-@" for part in re.split(r"[;\t]", name) if part.strip())
+    for name in (row[0], header[1], plain_text(formula)):  # of an exported folder, which escapes tabs
+        assert name.replace("'", "").replace(r"\t", "\t") == formula.replace("'", "") and name != formula
+        assert not any(trim(part)[:1] in "=+-@＝＋－＠" for part in re.split(r"[;\t]", name) if part.strip())
 
 
 @settings(deadline=None, max_examples=60)

@@ -91,9 +91,18 @@ def register() -> None:
 
 
 def in_quotes(text: str) -> str:
-    """Return a text in quotes, so that Hydra's grammar reads exactly this text."""
-    ending = re.sub(r"(\\+)$", r"\1\1", text)
-    return "'" + re.sub(r"(\\*)'", r"\1\1\\'", ending) + "'"
+    """Return a text in quotes, so that Hydra's grammar reads exactly this text.
+
+    The text may come from an untrusted source and be long, so the time is linear in its length.
+    """
+    return "'" + re.sub(r"(\\++)('|\Z)?|'", _escape_quote, text) + "'"
+
+
+def _escape_quote(match: re.Match[str]) -> str:
+    """Return backslashes and a quotation mark as they stand in quotes: backslashes count only before the mark."""
+    if match[0] == "'":
+        return "\\'"
+    return match[1] if match[2] is None else 2 * match[1] + ("\\'" if match[2] else "")
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

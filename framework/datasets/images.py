@@ -46,8 +46,12 @@ BITS_PER_SAMPLE, PHOTOMETRIC = 258, 262
 """Numbers of two TIFF entries: the bits per value, and the meaning of the value 0 (0: white, 1: black)."""
 TILE_SIDES = (322, 323)
 """Numbers of the TIFF entries with the width and the height of a tile, which may be larger than the image."""
-JPEG_MARKER = re.compile(rb"\xff+([^\x00\x01\xd0-\xd7\xff])")
-"""Pattern of a marker of a JPEG file; 00, 01 and D0 to D7 belong to the compressed pixels (ITU-T T.81, Table B.1)."""
+JPEG_MARKER = re.compile(rb"\xff([^\x00\x01\xd0-\xd7\xff])")
+"""Pattern of a marker of a JPEG file; 00, 01 and D0 to D7 belong to the compressed pixels (ITU-T T.81, Table B.1).
+
+More bytes ff may stand before a marker. The pattern leaves them out, because it would take quadratic time for a file of
+such bytes alone.
+"""
 MODES = {1: "L", 3: "RGB", 4: "RGBA"}
 """Pillow's modes of decoded images, by number of channels."""
 READ_AT_ONCE = 2**16

@@ -38,10 +38,18 @@ FIGURES = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 BLANKS = " \N{NO-BREAK SPACE}\N{THIN SPACE}\N{NARROW NO-BREAK SPACE}"
 INVISIBLE = "\ufeff\u200b\u200c\u200d\u200e\u200f\u2060"
 """Zero-width characters, which text copied from web pages and office programs contains."""
+AT_ENDS = INVISIBLE + "".join(filter(str.isspace, map(chr, range(0x3001))))
+"""Characters that `trim` removes: the zero-width characters, and all blanks of Unicode."""
 
 
-FORMULA = re.compile(r"(^|[;,\t\r\n])(\s*)([=+\-@])(?=[^;,\t\r\n]*[(|!])")
-"""Pattern of a formula that calls a function or a program, at the start of a cell for any separator of cells."""
+FORMULA = re.compile(
+    rf"(^|[;,\t\r\n])((?:[^\S\t\r\n]|[\x00-\x08\x0e-\x1f{INVISIBLE}])*+)([=+\-@＝＋－＠])(?=[^;,\t\r\n]*[(|!])"
+)
+"""Pattern of a formula that calls a function or a program, at the start of a cell for any separator of cells.
+
+Blanks and invisible characters may stand before the sign, and the sign may be a full-width one. The blanks do not
+include separators, so that the time is linear in the length of the text.
+"""
 
 
 def defuse_formulas(cell: str) -> str:
@@ -106,10 +114,7 @@ def words_of(written: str) -> list[str]:
 
 def trim(cell: str) -> str:
     """Return a cell without blanks and zero-width characters at its ends."""
-    cell = cell.strip()
-    while cell and (cell[0] in INVISIBLE or cell[-1] in INVISIBLE):
-        cell = cell.strip(INVISIBLE).strip()
-    return cell
+    return cell.strip(AT_ENDS)
 
 
 def column_name(cell: str) -> str:

@@ -8,6 +8,7 @@ addresses, and the program contacts the address that the user gave.
 
 import os
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -25,7 +26,12 @@ _MEANING = r"[%?\x00-\x1f\x7f]"
 """Pattern of characters in a path that have a special meaning in an address of SQLAlchemy."""
 _ESCAPED = r"[%?#'\"\\\x00-\x1f\x7f]"
 """Pattern of characters in a path that MLflow would change, because it decodes the path and writes it into SQL."""
-_SECRET = r"([?&][^=&\s]*(?:pass|pwd|token|secret)[^=&\s]*=)[^&\s]*"
+_USER_WITH_SLASH = re.compile(r"(?<!sqlite)(://)[^/@:]*:")
+"""Pattern of the beginning of an address with a user name and a password."""
+_KEY, _VALUE = re.compile(r"[?&][^=&\s]*+=?"), re.compile(r"[^&\s]*")
+"""Patterns of a key in the query of an address, with its equals sign if there is one, and of a value."""
+_SECRET = re.compile("pass|pwd|token|secret")
+"""Pattern of the keys whose values are secret."""
 
 
 @dataclass(frozen=True)
@@ -192,10 +198,30 @@ def require_own_files(uri: str, locations: tuple[str, ...] = ()) -> None:
 
 
 def without_password(text: str) -> str:
-    """Return a text with the user names, passwords and tokens of all addresses in it removed."""
+    """Return a text with the user names, passwords and tokens of all addresses in it removed.
+
+    A text may come from an untrusted source and be long, so the time is linear in its length.
+    """
     text = re.sub(r"(?<!sqlite)(://)[^\s/]*@", r"\1", text)
-    text = re.sub(r"(?<!sqlite)(://)[^\s/@:]*:[^\s@]*@", r"\1", text)  # a password that contains a slash
-    return re.sub(_SECRET, r"\1", text)
+    text = re.sub(r"([^\s@]++)(@?)", _without_user, text)
+    kept, end = [], 0
+    for key in _secret_keys(text):
+        if key.start() >= end:  # no part of a value that is removed
+            kept.append(text[end : key.end()])
+            value = _VALUE.match(text, key.end())
+            end = key.end() if value is None else value.end()
+    return "".join([*kept, text[end:]])
+
+
+def _without_user(match: re.Match[str]) -> str:
+    """Return what stands before an "@" without a user name and a password that contains a slash."""
+    begun = _USER_WITH_SLASH.search(match[1]) if match[2] else None
+    return match[0] if begun is None else match[1][: begun.end(1)]
+
+
+def _secret_keys(text: str) -> Iterator[re.Match[str]]:
+    """Yield the keys of passwords and tokens in the queries of addresses, with their equals signs."""
+    return (key for key in _KEY.finditer(text) if key[0].endswith("=") and _SECRET.search(key[0]))
 
 
 def require_no_password(uri: str) -> None:
@@ -205,7 +231,7 @@ def require_no_password(uri: str) -> None:
         ConfigError: The address contains a password.
     """
     # the user name of an http address may be a token
-    if re.search(r"^https?://[^\s/]*@|^\w[\w+]*://[^\s/@]*:[^\s@]*@", uri) or re.search(_SECRET, uri):
+    if re.search(r"^https?://[^\s/]*@|^\w[\w+]*://[^\s/@:]*:[^\s@]*@", uri) or any(_secret_keys(uri)):
         raise ConfigError(
             f"logger.uri={shorten(without_password(uri))} was given with a password, which is refused, because "
             "commands and configs are stored and other users can see them. Put the whole address into the environment "

@@ -17,6 +17,7 @@ import importlib
 import json
 import math
 import os
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -30,6 +31,12 @@ from framework.distributions.numpy_densities import Density, build
 
 MOST_POINTS = 2**13
 """Largest number of points that the network reads at once; more points do not fit into the caches."""
+CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+"""Pattern of characters that control a terminal, or change the direction of a text."""
+FORMULA = re.compile(
+    "(^|[;,\t\r\n])((?:[^\\S\t\r\n]|[\ufeff\u200b-\u200f\u2060])*+)([=+\\-@＝＋－＠])(?=[^;,\t\r\n]*[(|!])"
+)
+"""Pattern of a formula that calls a function or a program, at the start of a cell for any separator of cells."""
 
 
 class Model:
@@ -301,8 +308,19 @@ def main(arguments: Mapping[str, Any] | None = None) -> None:
         sys.exit(str(error))
     if rows:
         writer = csv.DictWriter(sys.stdout, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+        writer.writerow({name: plain_text(name) for name in writer.fieldnames})
+        writer.writerows({name: plain_text(cell) for name, cell in row.items()} for row in rows)
+
+
+def plain_text(cell: Any) -> Any:
+    """Return a text that steers no terminal, and in which a spreadsheet finds no formula; return numbers unchanged.
+
+    The names of classes and columns may come from another person. An apostrophe before a formula makes it plain text.
+    """
+    if not isinstance(cell, str):
+        return cell
+    text = CONTROL.sub(lambda letter: repr(letter[0])[1:-1], cell)
+    return FORMULA.sub(r"\1\2'\3", text)
 
 
 def command() -> None:
