@@ -1,15 +1,20 @@
 """Tests of mode=check: a correct plugin passes, and a faulty one fails with the place of its fault."""
 
 import math
+import re
 from pathlib import Path
 
 import pytest
 import torch
+from torch.distributions import MultivariateNormal
 
+from framework.distributions.protocol import marginal
 from framework.errors import ConfigError
 from framework.testing import contract as contracts
 from framework.testing.finding import Finding, Worst, require, run_check
+from plugins.density_head.gaussian.head import GaussianHead
 from tests.conftest import Framework, listed
+from tests.planted_heads import HEIGHT
 
 
 def test_a_strangers_head_passes_by_name(framework: Framework) -> None:
@@ -161,6 +166,20 @@ def test_what_a_check_raises_is_told() -> None:
 
     found = run_check("entropy", 1.0, look)
     assert (found.worst, found.error) == ("NotImplementedError: no entropy", math.inf)
+
+
+def test_an_error_of_a_plugin_is_told_with_its_line() -> None:
+    density = GaussianHead(HEIGHT)(torch.zeros(1, 2))
+    run = lambda worst: density.log_prob("one")  # type: ignore[arg-type]  # noqa: E731
+    assert re.search(
+        r"TypeError: .* \(raised at density_head/gaussian/\w+\.py:\d+\)$", run_check("", 1.0, run).worst
+    )
+
+
+def test_a_sentence_for_users_is_told_without_a_line() -> None:
+    density = MultivariateNormal(torch.zeros(1, 2), torch.eye(2))
+    worst = run_check("", 1.0, lambda worst: worst.count(marginal(density, 3).has_rsample, "")).worst
+    assert "raised at" not in worst
 
 
 def test_a_check_that_hangs_is_ended() -> None:

@@ -1,5 +1,7 @@
 """Detection of mixed devices by `mode=check`, and its silence about the framework's own densities."""
 
+import re
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -18,6 +20,12 @@ from framework.testing.protocol_checks import protocol_calls
 from plugins.density_head.von_mises.density import VonMises
 from tests.planted_heads import CLASSES, HEIGHT, ONE, PLACE
 
+
+def sign_by_device(x: Tensor) -> Tensor:
+    """Return -x, by separate code for each kind of device."""
+    return x.neg() if x.is_cuda else 0 - x
+
+
 RIGHT: dict[str, Callable[[Tensor], object]] = {
     "single numbers in arithmetic": lambda x: x * torch.tensor(2.0) + torch.where(x > 0, x, torch.zeros(())),
     "an index of the CPU": lambda x: x[torch.arange(2)] + x[torch.ones(3, dtype=torch.bool)][:2],
@@ -32,6 +40,7 @@ RIGHT: dict[str, Callable[[Tensor], object]] = {
     "moved away from it": lambda x: torch.ones(3) + torch.from_numpy(x.cpu().numpy()) + x.detach().to("cpu"),
     "moved there and back": lambda x: x + torch.from_numpy(x.cpu().numpy()).to(x.device),
     "by where it is": lambda x: torch.from_numpy(x.numpy()) + x if not x.is_cuda else x,
+    "given to code for each device": lambda x: x + sign_by_device(torch.ones_like(x)),
     "Python numbers": lambda x: torch.tensor([x[0].item(), *x.tolist()]) + torch.ones(4),
     "sums of rows": lambda x: sum(torch.tensor(row.item()) for row in x) + x,
 }
@@ -51,6 +60,10 @@ WRONG: dict[str, Callable[[Tensor], object]] = {
     "rows of the CPU": lambda x: [row + x for row in torch.zeros(2, 3)],
     "a mask of the CPU": lambda x: x.masked_fill(torch.ones(3, dtype=torch.bool), 0.0),
     "written in place": lambda x: torch.zeros(3).add_(x),
+    "made on the CPU and given to code for each device": lambda x: x + sign_by_device(torch.ones(3)),
+    "weights of a mixture": lambda x: Mixture(
+        torch.zeros(3, 2), of_normals(x[:, None, None].expand(3, 2, 1))
+    ).log_prob(x[:, None]),
 }
 
 
@@ -70,6 +83,17 @@ def test_what_cuda_allows_is_no_fault(name: str) -> None:
 @pytest.mark.parametrize("name", WRONG)
 def test_what_cuda_refuses_is_a_fault(name: str) -> None:
     assert mixes(WRONG[name])
+
+
+def test_a_fault_names_the_line_that_made_the_tensor_of_the_cpu() -> None:
+    mode = OneDevice()
+    x = mode.label_device(torch.tensor([0.3, 0.1, 0.7]))
+    with mode:
+        made = torch.ones(3)
+        line = sys._getframe().f_lineno - 1
+        _ = x + made.double().exp()
+    (fault,) = mode.faults
+    assert re.search(rf"\(3,\) on the CPU \(created at \S*tests/test_devices\.py:{line}\)", fault)
 
 
 def of_normals(raw: Tensor) -> Distribution:

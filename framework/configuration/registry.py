@@ -71,6 +71,13 @@ def _entries(group: str) -> dict[str, list[Entry]]:
     return entries_by_name
 
 
+@cache
+def plugin_packages() -> frozenset[str]:
+    """Return the names of the top-level packages that hold the installed plugins, without importing them."""
+    groups = [_entry_points().select(group=f"framework.{group}") for group in GROUPS]
+    return frozenset(entry.value.partition(":")[0].partition(".")[0] for group in groups for entry in group)
+
+
 def origin(entry: Entry) -> str:
     """Return name and version of the package that an entry point comes from, such as 'their-package 1.2'."""
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "an unknown package"

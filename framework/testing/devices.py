@@ -7,7 +7,7 @@ call with tensors of both labels is recorded if CUDA would raise an error. No te
 
 import dis
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from types import CodeType, FrameType
 from typing import Any
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from framework.testing.finding import SEED, TooSlow, Worst, seed
+from framework.testing.finding import SEED, TooSlow, Worst, seed, short_place
 
 DEVICE = torch.device("cpu", 0)
 """Device that `tensor.device` returns for a tensor with the label "on the device", as if it were on a GPU.
@@ -54,6 +54,8 @@ Calls = Iterator[tuple[str, Callable[[], Any]]]
 """Names of calls to check, each with a function that performs the call."""
 _on_device: Any = WeakTensorKeyDictionary()
 """Tensor → true if its label is "on the device", false if it is "on the CPU"; tensors without a label are absent."""
+_created_at: Any = WeakTensorKeyDictionary()
+"""Tensor on the CPU → file and line at which it, or a tensor from which it is computed, was created there."""
 
 
 class OneDevice(TorchFunctionMode):
@@ -142,7 +144,7 @@ class OneDevice(TorchFunctionMode):
             inside = [tensor for tensor in received if _on_device.get(tensor)]
             if inside and any(name in STRICT or tensor.dim() > 0 for tensor in mixed):
                 shapes = ", ".join(
-                    f"{tuple(tensor.shape)} on the {'device' if _on_device.get(tensor) else 'CPU'}"
+                    f"{tuple(tensor.shape)} on the {'device' if _on_device.get(tensor) else 'CPU'}{_origin(tensor)}"
                     for tensor in received
                     if _on_device.get(tensor) is not None
                 )
@@ -199,15 +201,27 @@ class OneDevice(TorchFunctionMode):
         if any(known):
             self.label_device(result)
         elif known and all(on_device is False for on_device in known):
-            self._label_on_cpu(result)
+            self._label_on_cpu(result, sources)
         return result
 
-    def _label_on_cpu(self, result: Any) -> None:
-        """Give tensors the label "on the CPU", unless a calling function has separate code for each kind of device."""
+    def _label_on_cpu(self, result: Any, sources: Sequence[Tensor] = ()) -> None:
+        """Give tensors the label "on the CPU", unless a calling function has separate code for each kind of device.
+
+        Such a function may create tensors and read constants in its code for the CPU only. What it computes from
+        tensors that others created on the CPU is on the CPU in any case.
+
+        Args:
+            result: the tensors.
+            sources: tensors on the CPU from which the tensors are computed; empty if they are created or moved there.
+        """
         tensors = [tensor for tensor in tensors_in(result) if _on_device.get(tensor) is not False]
-        if tensors and not _has_device_code():
+        places = [_created_at[tensor] for tensor in sources if tensor in _created_at]
+        if tensors and (places or not _has_device_code()):
+            place = places[0] if places else _call_site() if not sources else None
             for tensor in tensors:
                 _on_device[tensor] = False
+                if place is not None:
+                    _created_at[tensor] = place
 
     def _check_index(self, name: str, tensor: Any, index: Any) -> None:
         """Record a fault if a tensor on the device indexes a tensor on the CPU; CUDA allows the reverse."""
@@ -315,6 +329,12 @@ def _label_constants(packages: set[str]) -> None:
                     _on_device[value] = False
 
 
+def _origin(tensor: Tensor) -> str:
+    """Return where a tensor on the CPU was created, as words for a message; "" if that is not known."""
+    place = _created_at.get(tensor)
+    return "" if _on_device.get(tensor) or place is None else f" (created at {place})"
+
+
 def _caller() -> FrameType | None:
     """Return the innermost stack frame of the recorded call; beartype may have added frames between it and here."""
     frame = sys._getframe(1)
@@ -375,7 +395,6 @@ def _call_site() -> str:
     frame = _caller()
     while frame is not None and frame.f_code.co_filename != __file__:
         if not _of_library(frame):
-            path = frame.f_code.co_filename
-            return f"{'/'.join(path.split('/')[-3:])}:{frame.f_lineno}"
+            return short_place(frame.f_code.co_filename, frame.f_lineno)
         frame = frame.f_back
     return "an unknown line"

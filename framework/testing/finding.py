@@ -6,11 +6,15 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from traceback import walk_tb
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from framework.configuration.registry import plugin_packages
+from framework.errors import UserError
 
 SEED = 20260
 
@@ -177,8 +181,34 @@ def run_check(name: str, limit: float, check: Callable[[Worst], None], *, second
             check(worst)
     except Exception as error:
         message = " ".join(f"{type(error).__name__}: {error}".split())
-        return Finding(name, message if len(message) <= 300 else message[:297] + "...", torch.inf, limit)
+        message = message if len(message) <= 300 else message[:297] + "..."
+        return Finding(name, message + _line_of(error), torch.inf, limit)
     return worst.finding(name, limit)
+
+
+def _line_of(error: BaseException) -> str:
+    """Return " (raised at <file>:<line>)", the innermost line of a plugin through which an error passed.
+
+    If it passed through no plugin, the line is the innermost one of the framework outside its checks. The result is ""
+    if there is none, and for an error whose message is a sentence for users.
+    """
+    if isinstance(error, UserError):
+        return ""
+    places: dict[bool, str] = {}
+    for frame, line in walk_tb(error.__traceback__):
+        module = str(frame.f_globals.get("__name__"))
+        package = module.partition(".")[0]
+        if package in plugin_packages() or (
+            package == "framework" and not module.startswith("framework.testing.")
+        ):
+            places[package == "framework"] = short_place(frame.f_code.co_filename, line)
+    place = places.get(False) or places.get(True)
+    return f" (raised at {place})" if place else ""
+
+
+def short_place(path: str, line: int) -> str:
+    """Return a file and a line for a message, with the last three parts of the path."""
+    return f"{'/'.join(path.split('/')[-3:])}:{line}"
 
 
 def failures(findings: Iterable[Finding]) -> list[str]:
