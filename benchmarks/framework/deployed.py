@@ -205,8 +205,9 @@ def main() -> None:
         "For images, the exported folder meets this; the frozen model does not for one image, because PyTorch computes "
         "the density. For small networks, `ONNX Runtime` alone is the fastest form, but it neither checks its inputs "
         "nor returns a density. The exported folder does both with NumPy, which takes 0.01 to 0.3 ms more for one "
-        "input. The frozen model does both with PyTorch, which takes longer. For basis points, the frozen model "
-        "searches for the nearest points with compiled code, but an ONNX file can only multiply matrices.\n\n"
+        "input. The frozen model does both with PyTorch, which takes longer, except for the classes of two moons. For "
+        "basis points, the frozen model searches for the nearest points with compiled code, but an ONNX file can only "
+        "multiply matrices.\n\n"
         f"{machine('torch', 'onnxruntime', 'numpy')} Command: `python -m benchmarks.framework.deployed`.\n"
     )
     write_page(__file__, text)
