@@ -72,6 +72,15 @@ class Objective(nn.Module, ABC):
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
         """Return the weighted penalty on this batch, a scalar in nats, differentiable in the predictor's parameters.
 
+        The penalty is a mean over the samples of the batch; it is a finite number, such as 0, for an empty batch, and
+        NaN or an error if the predictor returns NaN. The densities of a wrapper of several models have the batch_shape
+        (batch, member); `framework.model.independent_penalty` combines penalties of this shape, so that each member
+        trains as it would train alone.
+
+        The method changes neither the batch nor the predictor. A further pass of inputs through the predictor would
+        change the running moments of batch norm, unless it stands in a block of `module_flags.set_flag(predictor,
+        BATCH_NORM, "track_running_stats", False)`. Random numbers come from torch's global generator.
+
         If the predictor predicts images, the images for the inputs of `batch` were computed for the loss already, and
         are reused (`framework.model.one_pass`).
         """

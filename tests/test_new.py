@@ -59,7 +59,7 @@ def test_a_new_plugin_passes_mode_check_as_written(
     assert {"pyproject.toml", "README.md", f"tests/test_my_{registry}.py"} < files
     assert not (tmp_path / "outputs").exists()
     assert not any(
-        re.search("example|<registry>", file.read_text(), re.IGNORECASE)
+        re.search('example|<registry>|^"""my', file.read_text(), re.IGNORECASE)
         for file in map(package.joinpath, files)
     )
     install(package)

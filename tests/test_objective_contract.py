@@ -4,12 +4,14 @@ import pytest
 import torch
 from torch import nn
 
+from framework.calibration.module_flags import BATCH_NORM, set_flag
 from framework.errors import ConfigError
+from framework.model import independent_penalty
 from framework.objective import Objective
 from framework.target import Target
 from framework.testing.finding import failures, require
 from framework.testing.objectives import examine_objective
-from framework.testing.rows import ObjectiveRow
+from framework.testing.rows import ANGLE, CLASSES, REALS, ObjectiveRow
 
 ROW = ObjectiveRow("reals", Target("real", ("x", "y")))
 
@@ -41,6 +43,20 @@ class Spread(Objective):
 
     def forward(self, predictor, batch):
         return self.weight * self.penalty(predictor, batch) / max(1, len(batch["input"]))
+
+
+class Broad(Objective):
+    """Correct objective: minus the mean entropy, which depends on the breadth of a density alone."""
+
+    def __init__(self, weight):
+        super().__init__()
+        self.weight = weight
+
+    def forward(self, predictor, batch):
+        inputs = batch["input"].to(next(predictor.parameters()).dtype)
+        with set_flag(predictor, BATCH_NORM, "track_running_stats", False):
+            entropy = independent_penalty(predictor.training_densities(inputs).entropy())
+        return -self.weight * entropy.sum() / max(1, len(entropy))
 
 
 class Averaging(Spread):
@@ -144,6 +160,11 @@ class Marking(Spread):
 
 def test_a_sound_objective_passes():
     require(*examine_objective(ROW, Spread))
+
+
+@pytest.mark.parametrize("target", [CLASSES, ANGLE, REALS], ids=lambda target: target.kind)
+def test_a_sound_objective_of_the_breadth_alone_passes(target):
+    require(*examine_objective(ObjectiveRow("entropy", target), Broad))
 
 
 @pytest.mark.parametrize(

@@ -97,7 +97,8 @@ class Cardioid(Distribution):
 
     def entropy(self) -> Tensor:
         # log 2π - (1/2π) ∫ (1 + s cos d) log(1 + s cos d) = log 4π - 1 + r - log(1 + r) with r = √(1 - s²)
-        root = (1 - self.strength.square()).sqrt()
+        # the lower bound keeps the gradient of the root finite at s = 1
+        root = (1 - self.strength.square()).clamp(min=torch.finfo(self.strength.dtype).tiny).sqrt()
         return self.event_shape[0] * (math.log(4 * math.pi) - 1 + root - torch.log1p(root))
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution
+from torch.nn.functional import softplus
 
 from framework.data import Batch
 from framework.distributions.batch_shapes import Stacked
@@ -28,6 +29,13 @@ STEPS = (1e-5, 1e-6, 1e-7, 1e-8)
 """Step lengths of central differences."""
 MANY = 130
 """Number of samples of a large batch."""
+MEMBERS = "penalties of members, (batch, member), are combined by framework.model.independent_penalty"
+"""Advice for an objective with wrong gradients of members."""
+SECOND_PASS = (
+    "a further pass through the predictor stands in a block of "
+    "framework.calibration.module_flags.set_flag(predictor, BATCH_NORM, 'track_running_stats', False)"
+)
+"""Advice for an objective that changes the running moments of batch norm."""
 DRAWS = 8
 """Number of seeds over which the penalty of an objective that draws random numbers is averaged."""
 
@@ -35,7 +43,8 @@ DRAWS = 8
 class Network(nn.Module):
     """Small network with batch norm, which has state, and dropout, which draws random numbers.
 
-    It returns the `simplest_density` for the target, with the location or the logits that its last layer gives.
+    It returns the `simplest_density` for the target, with the location or the logits, and the breadth, that its last
+    layer gives.
 
     Attributes:
         gain: Factor on the raw parameters, which can make them extreme.
@@ -47,13 +56,14 @@ class Network(nn.Module):
         self.first = nn.Linear(LENGTH, 8)
         self.norm = nn.BatchNorm1d(8)
         self.dropout = nn.Dropout(0.2)
-        self.last = nn.Linear(8, place_size(target))
+        self.last = nn.Linear(8, place_size(target) + 1)
         self.gain = 1.0
 
     def forward(self, inputs: Tensor) -> Distribution:
         numbers = inputs / 255 if inputs.dtype == torch.uint8 else inputs
         hidden = self.norm(self.first(numbers.to(self.first.weight.dtype)).tanh())
-        return simplest_density(self.target, self.gain * self.last(self.dropout(hidden)))
+        raw = self.gain * self.last(self.dropout(hidden))
+        return simplest_density(self.target, raw[..., :-1], 1 + softplus(raw[..., -1]))
 
 
 class Members(Predictor):
@@ -156,7 +166,9 @@ def penalty(objective: Objective, predictor: Predictor, batch: Batch) -> Tensor:
 def gradients(objective: Objective, predictor: Predictor, batch: Batch) -> dict[str, Tensor]:
     """Return name → gradient of the penalty, for every parameter with a gradient."""
     predictor.zero_grad()
-    penalty(objective, predictor, batch).backward()
+    value = penalty(objective, predictor, batch)
+    if value.requires_grad:
+        value.backward()
     return {
         name: parameter.grad.clone()
         for name, parameter in predictor.named_parameters()
@@ -217,7 +229,9 @@ def _gradient(build: Make, row: ObjectiveRow, worst: Worst) -> None:
         name: torch.randn(parameter.shape, dtype=torch.float64, generator=generator)
         for name, parameter in parameters.items()
     }
-    analytic = sum((analytic_gradients[name] * direction[name]).sum().item() for name in analytic_gradients)
+    analytic = sum(
+        ((analytic_gradients[name] * direction[name]).sum().item() for name in analytic_gradients), 0.0
+    )
 
     def penalty_at(amount: float) -> float:
         other = copy.deepcopy(predictor)
@@ -279,7 +293,10 @@ def _side_effects(build: Make, row: ObjectiveRow, worst: Worst) -> None:
         worst.count(bool(changed), f"training modes changed: {', '.join(changed) or 'none'}")
         for name, value in predictor.state_dict().items():
             worst.same_bits(
-                f"{name} after a penalty, {'training' if training else 'evaluation'} mode", value, state[name]
+                f"{name} after a penalty, {'training' if training else 'evaluation'} mode"
+                + (f"; {SECOND_PASS}" if ".norm." in name else ""),
+                value,
+                state[name],
             )
         for name, parameter in predictor.named_parameters():
             worst.count(parameter.grad is not None, f"{name} has a gradient after a penalty")
@@ -357,7 +374,9 @@ def _different_members(build: Make, row: ObjectiveRow, worst: Worst) -> None:
         for name, gradient in gradients(objective, alone, batch).items():
             other = whole.get(name.replace("networks.0", f"networks.{index}"), torch.zeros_like(gradient))
             scale = gradient.abs().max().clamp(min=1e-6)
-            worst.record((other - gradient).abs().max() / scale, f"gradient of member {index}, {name}")
+            worst.record(
+                (other - gradient).abs().max() / scale, f"gradient of member {index}, {name}; {MEMBERS}"
+            )
     expected = sum(member_penalties) / len(member_penalties)
     worst.record(
         abs(joint_penalty - expected) / max(abs(expected), 1e-6),
@@ -433,7 +452,9 @@ def _members(build: Make, row: ObjectiveRow, worst: Worst) -> None:
                 name.replace("networks.0", f"networks.{index}"), torch.zeros_like(gradient)
             )
             scale = gradient.abs().max().clamp(min=1e-6)
-            worst.record((other - gradient).abs().max() / scale, f"gradient of member {index}, {name}")
+            worst.record(
+                (other - gradient).abs().max() / scale, f"gradient of member {index}, {name}; {MEMBERS}"
+            )
 
 
 def _number_types(build: Make, row: ObjectiveRow, worst: Worst) -> None:
@@ -476,4 +497,7 @@ def _small(build: Make, row: ObjectiveRow, worst: Worst) -> None:
         predictor = predictor_of(row).eval()
         value = penalty(build(1.0), predictor, batch_of(row, count))
         worst.same(f"shape of the penalty of {count} samples", tuple(value.shape), ())
-        worst.finite(f"penalty of {count} samples", value)
+        worst.count(
+            not bool(value.isfinite()),
+            f"penalty of {count} samples: {value.item():g}, expected a finite number",
+        )

@@ -1,4 +1,4 @@
-"""Example of a metric: the mean of the largest error of each sample."""
+"""Mean over samples of the largest error of each sample."""
 
 from typing import ClassVar
 

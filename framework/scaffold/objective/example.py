@@ -1,4 +1,4 @@
-"""Example of an objective: the training loss at noisy inputs."""
+"""Training loss at noisy inputs."""
 
 from typing import Annotated
 
