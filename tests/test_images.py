@@ -3,6 +3,7 @@
 import io
 import math
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -180,6 +181,33 @@ def test_load_leaves_out_what_cannot_be_read_with_its_fields(tmp_path: Path) -> 
         assert [int(item["input"][0, 0, 0]) for item in items] == [0, 1, 3]
     table, faults = images.load([], {"target": torch.empty(0)}, "images", in_memory=True)
     assert (len(table), faults) == (0, [])
+
+
+@pytest.mark.parametrize(
+    "name, advice",
+    [
+        ("a/0", "Did you mean 0.png?"),
+        ("0.png", "Did you mean a/0.png?"),
+        ("a\\0.png", "Write / instead of \\ in the path."),
+        ("a/1.png", "Correct the path."),
+        ("b/0.png", "Correct the path."),
+    ],
+)
+def test_the_message_about_a_missing_image_names_a_similar_path(
+    tmp_path: Path, name: str, advice: str
+) -> None:
+    (tmp_path / "a").mkdir()
+    save(tmp_path / "a", np.zeros((4, 4, 3), np.uint8), name="0.png")
+    with pytest.raises(DataError, match=re.escape(f"{name}: no such file; expected an image. {advice}")):
+        Crop(tmp_path / name, None, 0.0, 2).read()
+
+
+def test_files_are_left_out_only_if_others_remain() -> None:
+    faults = [DataError("a"), DataError("b")]
+    assert "or set data.unreadable=skip to leave" in images.advise_unreadable(
+        faults, 3, "data.unreadable=skip"
+    )
+    assert "data.unreadable" not in images.advise_unreadable(faults, 2, "data.unreadable=skip")
 
 
 def test_long_lists_of_faults_are_cut() -> None:

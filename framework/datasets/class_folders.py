@@ -14,6 +14,15 @@ SPLITS = ("train", "validation", "test")
 """Names of the folders of splits."""
 
 
+OTHER_NAMES = {
+    **{name: name for name in SPLITS},
+    **dict.fromkeys(("training", "trainset", "train_set"), "train"),
+    **dict.fromkeys(("val", "valid", "dev", "validate"), "validation"),
+    **dict.fromkeys(("testing", "testset", "test_set", "eval"), "test"),
+}
+"""Names, in small letters, that other programs give to the folders of splits, and the names that are read here."""
+
+
 def describe_layouts(suffixes: Iterable[str]) -> str:
     """Return advice that names the layouts that `list_files` reads, for files with these suffixes."""
     return (
@@ -67,7 +76,7 @@ def list_files(root: Path, suffixes: Collection[str], fewest: int = 2) -> FileLi
             )
             raise DataError(
                 f"data.root = {root} {fault}. The folders of splits are {', '.join(SPLITS)}; only validation may be "
-                f"missing. {remedy}"
+                f"missing.{_suggest_split(unexpected)} {remedy}"
             )
         folders_of_class = [
             (inner.name, split.name, inner) for split in folders for inner in subfolders(split, remedy)
@@ -83,19 +92,28 @@ def list_files(root: Path, suffixes: Collection[str], fewest: int = 2) -> FileLi
                 )
             if inner_names and not by_split:
                 raise DataError(
-                    f"data.root = {root}: The folder {path.name} holds further folders ({', '.join(inner_names)}). "
-                    + remedy
+                    f"data.root = {root}: The folder {path.name} holds further folders ({', '.join(inner_names)})."
+                    f"{_suggest_split([path.name])} {remedy}"
                 )
         splits = ("test", "train") if by_split else ("",)
         folders_of_class = [(path.name, split, path / split) for path in folders for split in splits]
     classes = sorted({name for name, _, _ in folders_of_class})
     if len(classes) < fewest:
+        found = f"only the class {classes[0]}" if classes else "no folder"
         raise DataError(
-            f"data.root = {root} holds {len(classes)} classes ({', '.join(classes) or 'no folder'}), but at least "
-            f"{fewest} are required. {remedy}"
+            f"data.root = {root} holds {found}, but folders of at least {fewest} classes are required. {remedy}"
         )
     folders_of_class.sort(key=lambda entry: (entry[1], entry[0]))
     return collect(classes, folders_of_class, suffixes, "file that can be read", remedy)
+
+
+def _suggest_split(names: Iterable[str]) -> str:
+    """Return ' Rename ...' for the first folder whose name resembles that of a split; "" if there is none."""
+    for name in names:
+        split = OTHER_NAMES.get(name.lower())
+        if split is not None:
+            return f" Rename the folder {name} to {split}."
+    return ""
 
 
 def collect(
@@ -125,8 +143,9 @@ def collect(
         matching = [path for path in entries if path.suffix.lower() in suffixes]
         ignored += len(entries) - len(matching)
         if not matching:
-            content = ", ".join(path.name for path in entries[:3]) or "nothing"
-            raise DataError(f"{folder} holds no {kind}, but {content}. {remedy}")
+            content = ", ".join(path.name for path in entries[:3])
+            fault = f"holds no {kind}, but {content}" if entries else f"is empty, but a {kind} is required"
+            raise DataError(f"{folder} {fault}. {remedy}")
         files += matching
         labels += [classes.index(name)] * len(matching)
         splits += [split] * len(matching)

@@ -1,5 +1,6 @@
 """Functions that read image files, crop squares, build data sets of the squares, and augment and blur images."""
 
+import itertools
 import math
 import os
 import re
@@ -40,6 +41,8 @@ FORMATS = ("AVIF", "BMP", "GIF", "ICO", "JPEG", "JPEG2000", "PCX", "PNG", "PPM",
 """Pillow formats that are read, because reading them only decodes pixels. EPS, for example, would start a program."""
 SUFFIXES = (".avif", ".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")
 """Usual suffixes of image files; a file with another suffix is read as an image if it can be decoded."""
+MOST_ENTRIES = 1000
+"""Largest number of entries of a folder that are searched for a missing image."""
 ORIENTATION = 0x0112
 """Number of the EXIF entry with the orientation of an image."""
 BITS_PER_SAMPLE, PHOTOMETRIC = 258, 262
@@ -127,7 +130,10 @@ def open_image(file: Path) -> Iterator[Image.Image]:
     """
     with (
         reading.translate_errors(
-            file, "an image", f"{reading.RESTORE} Scale the image down if it is too large."
+            file,
+            "an image",
+            f"{reading.RESTORE} Scale the image down if it is too large.",
+            advise_missing(file),
         ),
         reading.open_regular(file) as stream,
         open_stream(_read_at_once(stream)) as image,
@@ -139,6 +145,26 @@ def _read_at_once(stream: reading.Bounded) -> BinaryIO | BytesIO:
     """Return the bytes of a small file in memory, because Pillow reads a file in dozens of pieces; else the file."""
     small = os.fstat(stream.fileno()).st_size <= READ_AT_ONCE
     return BytesIO(stream.read()) if small else stream
+
+
+def advise_missing(file: Path) -> str:
+    """Return advice about an image that does not exist, for a similar path that exists; "" if none is known.
+
+    The similar paths are those with / for each backslash, with a suffix of images, and in a folder beside the file.
+    """
+    if file.exists():
+        return ""
+    if "\\" in file.name and Path(str(file).replace("\\", "/")).exists():
+        return "expected an image. Write / instead of \\ in the path."
+    with_suffix = (f"{file.name}{suffix}" for suffix in SUFFIXES)
+    similar = [name for name in with_suffix if (file.parent / name).exists()]
+    if not similar and file.parent.is_dir():
+        with os.scandir(file.parent) as entries:
+            folders = [entry.name for entry in itertools.islice(entries, MOST_ENTRIES) if entry.is_dir()]
+        similar = [
+            f"{folder}/{file.name}" for folder in folders if (file.parent / folder / file.name).exists()
+        ]
+    return f"expected an image. Did you mean {similar[0]}?" if similar else ""
 
 
 @contextmanager
@@ -471,6 +497,7 @@ def load_splits(
     faults: Sequence[DataError] = (),
     *,
     skip_unreadable: bool,
+    skip_setting: str = "data.skip_unreadable=true",
     generated_in: Path | None = None,
 ) -> tuple[dict[str, Fields | Crops], int]:
     """Return a data set of the readable crops of each split, and the number of samples that cannot be read.
@@ -480,6 +507,7 @@ def load_splits(
         fields: further fields of each split, by the split's name.
         faults: errors of further samples, which have no crop because their labels could not be read.
         skip_unreadable: leave out samples that cannot be read.
+        skip_setting: setting of the data set that leaves them out, for the message.
         generated_in: the cache folder of generated images; None: the images are the user's.
 
     Raises:
@@ -494,7 +522,7 @@ def load_splits(
     }
     faults = [*faults, *(fault for _, bad in loaded.values() for fault in bad)]
     if faults and not skip_unreadable:
-        remedy = "Copy the files again from their source, or set data.skip_unreadable=true to leave them out."
+        remedy = advise_unreadable(faults, total, skip_setting)
         if generated_in is not None:
             remedy = f"Delete {generated_in}; the next run generates the data again."
         raise DataError(fault_message(faults, total, remedy))
@@ -534,6 +562,18 @@ def load_unlabelled(crops: Sequence[Crop]) -> Fields | Crops:
 def fit_in_memory(crops: int, side: int, channels: int) -> bool:
     """Return whether `crops` crops of `side` × `side` pixels take at most IN_MEMORY bytes."""
     return crops * channels * side**2 <= IN_MEMORY
+
+
+def advise_unreadable(faults: Sequence[DataError], total: int, skip_setting: str) -> str:
+    """Return advice about samples that cannot be read: to correct them, or to leave them out if others remain.
+
+    Args:
+        faults: errors of the samples.
+        total: number of all samples.
+        skip_setting: setting that leaves such samples out.
+    """
+    rest = f", or set {skip_setting} to leave them out" if len(faults) < total else ""
+    return f"Correct these files or copy them again from their source{rest}."
 
 
 def fault_message(faults: Sequence[DataError], total: int, remedy: str) -> str:

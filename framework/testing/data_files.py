@@ -98,9 +98,14 @@ def damaged_files(bench: Workbench, worst: Worst) -> None:
 
 
 def skipped_files(bench: Workbench, worst: Worst) -> None:
-    """Check that the samples of an unreadable file are left out, and that `skipped` counts them."""
+    """Check that the samples of an unreadable file are left out, and that `skipped` counts them.
+
+    Without the settings that leave samples out, the error must name these settings.
+    """
     pattern = next(iter(bench.row.fragile))
     workspace, source = bench.copy_files(lambda root: damage(first_match(root, pattern), "garbage"))
+    settings = [f"data.{key}={str(value).lower()}" for key, value in bench.row.skip.items()]
+    check_refused(lambda: bench.prepare_in(workspace, **source), settings, "an unreadable file", worst)
     remaining = bench.prepare_in(workspace, **source, **bench.row.skip)
     missing_count = total_samples(bench.data) - total_samples(remaining)
     worst.count(remaining.skipped < 1, f"skipped {remaining.skipped} after damage to {pattern}")

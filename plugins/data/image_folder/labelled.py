@@ -116,7 +116,15 @@ class LabelledImages:
         elif pairs := find_pairs(root):
             listed = _list_idx(pairs)
         else:
-            files = list_files(root, SUFFIXES, fewest)
+            try:
+                files = list_files(root, SUFFIXES, fewest)
+            except DataError as error:
+                tables = sorted(path.name for path in root.glob("*.csv")) if root.is_dir() else []
+                if not tables:
+                    raise
+                raise DataError(
+                    f"{error} If {quote(tables[0])} is a table of labels, set data.csv={tables[0]}."
+                ) from error
             listed = Listed(
                 [path.relative_to(root).as_posix() for path in files.files],
                 [files.classes[label] for label in files.labels],
@@ -179,7 +187,12 @@ class LabelledImages:
                 split: [self.crop(root / listed.names[i]) for i in chosen]
                 for split, chosen in indices.items()
             }
-            tables, skipped = load_splits(crops, fields, skip_unreadable=self.unreadable == "skip")
+            tables, skipped = load_splits(
+                crops,
+                fields,
+                skip_unreadable=self.unreadable == "skip",
+                skip_setting="data.unreadable=skip",
+            )
         else:
             tables = {}
             for split, chosen in indices.items():

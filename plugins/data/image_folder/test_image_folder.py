@@ -143,6 +143,15 @@ def test_mistakes_in_settings_are_named(tmp_path: Path, settings: dict[str, Any]
         prepared("image_folder", **{**write_folders(tmp_path), **SMALL, **settings})
 
 
+def test_a_table_beside_folders_that_are_no_classes_is_named(tmp_path: Path) -> None:
+    write_image(tmp_path / "all" / "0.png", 0)
+    (tmp_path / "labels.csv").write_text("file,label\nall/0.png,cat", encoding="utf-8")
+    with pytest.raises(
+        DataError, match=r"only the class all, .* is a table of labels, set data.csv=labels.csv"
+    ):
+        prepared("image_folder", root=str(tmp_path), **SMALL)
+
+
 @pytest.mark.parametrize(
     "table, message",
     [

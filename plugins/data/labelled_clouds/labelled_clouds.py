@@ -116,7 +116,7 @@ def load_listed(
     reading: Reading,
     cache_folder: str,
     unreadable: Unreadable,
-    remedy: str = "Copy them again from their source, or set data.unreadable=skip to leave them out.",
+    remedy: str | None = None,
 ) -> tuple[FileList, Packed]:
     """Return the list of the files that could be read, and their clouds.
 
@@ -126,14 +126,16 @@ def load_listed(
         reading: Settings for turning files into clouds.
         cache_folder: Name of the cache folder that stores the clouds.
         unreadable: Treatment of files that cannot be read.
-        remedy: Advice in the message about files that cannot be read.
+        remedy: Advice in the message about files that cannot be read; None: to correct them or to leave them out.
 
     Raises:
         DataError: Some files cannot be read and are not to be skipped.
     """
     loaded = load_files(listed.files, root, reading, cache_folder)
     if loaded.faults and unreadable == "error":
-        raise DataError(images.fault_message(loaded.faults, len(listed.files), remedy))
+        total = len(listed.files)
+        advice = remedy or images.advise_unreadable(loaded.faults, total, "data.unreadable=skip")
+        raise DataError(images.fault_message(loaded.faults, total, advice))
     return listed.select(loaded.good), loaded.packed
 
 

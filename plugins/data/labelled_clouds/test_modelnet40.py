@@ -136,7 +136,7 @@ def test_other_layouts_and_classes_are_refused(prepare_data, tmp_path):
         prepare_data(root=root, classes=["box"])
     for file in (root / "crate" / "test").iterdir():
         file.unlink()
-    with pytest.raises(DataError, match=r"crate/test holds no \.off file"):
+    with pytest.raises(DataError, match=r"crate/test is empty, but a \.off file is required"):
         prepare_data(root=root)
 
 

@@ -177,12 +177,14 @@ def test_own_files_are_read_without_prepare(data, tmp_path):
 
 
 def test_other_layouts_are_refused(prepare_data, tmp_path):
-    with pytest.raises(DataError, match=r"0 classes \(no folder\)"):
+    with pytest.raises(DataError, match="holds no folder, but folders of at least 2 classes"):
         prepare_data(root=tmp_path)
     cloud_file(tmp_path / "a" / "1.xyz")
-    with pytest.raises(DataError, match=r"1 classes \(a\), but at least 2"):
+    with pytest.raises(DataError, match="holds only the class a, but"):
         prepare_data(root=tmp_path)
     (tmp_path / "b").mkdir()
+    with pytest.raises(DataError, match=r"b is empty, but a file that can be read is required"):
+        prepare_data(root=tmp_path)
     (tmp_path / "b" / "notes.txt").write_text("")
     with pytest.raises(DataError, match=r"b holds no file that can be read, but notes\.txt"):
         prepare_data(root=tmp_path)
@@ -196,7 +198,13 @@ def test_other_layouts_are_refused(prepare_data, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "folder, message", [("val", "holds a folder val beside"), (None, "holds no folder test")]
+    "folder, message",
+    [
+        ("val", "holds a folder val beside .* Rename the folder val to validation"),
+        ("Test", "holds a folder Test beside .* Rename the folder Test to test"),
+        ("mine", "only validation may be missing. Set data.root"),
+        (None, "holds no folder test"),
+    ],
 )
 def test_incomplete_splits_are_refused(prepare_data, tmp_path, folder, message):
     for split in filter(None, ("train", folder, "test" if folder else None)):

@@ -160,9 +160,11 @@ class TableTennis(Data):
             try:
                 flights += self._flights_of(file)
                 unread = unread_columns(file, self.writing) if unread is None else unread
-            except DataError:
+            except DataError as error:
                 if self.unreadable == "error":
-                    raise
+                    raise DataError(
+                        f"{error} Or set data.unreadable=skip to leave such files out."
+                    ) from error
                 left_out += 1
         self._unread_columns = unread or []
         return flights, left_out
