@@ -102,7 +102,7 @@ LISTED_WHOLE, LISTED = 24, 8
 def nearest_name(word: str, known: Iterable[str], likeness: float = LEAST_SIMILARITY) -> str | None:
     """Return the name most similar to `word`, or None if no name is similar.
 
-    'lr' is similar to learning_rate, and 'moons' to moons/everything.
+    'lr' is similar to learning_rate, 'moons' to moons/everything, and 'BMI' to bmi.
 
     Args:
         word: word that is not the name of anything.
@@ -110,7 +110,8 @@ def nearest_name(word: str, known: Iterable[str], likeness: float = LEAST_SIMILA
         likeness: smallest similarity of two words, from 0 to 1 (`difflib.SequenceMatcher.ratio`).
     """
     word, names = shorten(word), list(islice(known, 1000))
-    near = get_close_matches(word, names, n=1, cutoff=likeness)
+    near = [name for name in names if name.casefold() == word.casefold()]
+    near = near or get_close_matches(word, names, n=1, cutoff=likeness)
     near = near or [name for name in names if "".join(piece[:1] for piece in name.split("_")) == word]
     near = near or [name for name in names if name.startswith((f"{word.rstrip('/')}/", f"{word}_"))]
     return near[0] if near else None

@@ -368,7 +368,7 @@ def test_words_with_figures_are_left_out_and_not_taken_for_numbers(tmp_path: Pat
     file.write_text("a;b\n" + "".join(f"{word};{row / 8}\n" for row in range(30)), encoding="utf-8")
     chosen = numeric_columns(read_columns(file, Writing()), (), "data.columns")
     assert chosen.names == ("b",)
-    assert chosen.left_out["a"] in ("words", "empty")
+    assert chosen.left_out["a"].partition(";")[0] in ("words", "dates", "empty")
 
 
 LONG = (

@@ -1,5 +1,6 @@
 """Tests of the reader of CSV columns, and of its messages, which name line and column."""
 
+import gzip
 import math
 from pathlib import Path
 
@@ -52,7 +53,12 @@ def test_an_empty_cell_in_a_table_of_one_column_is_a_row(tmp_path: Path) -> None
         ("a,b\n1,2\n1,2,3", "line 3: the line has 3 cells, but the first line names 2"),
         ("a,b\n1,2\n1\n", "line 3: the line has 1 cells, but the first line names 2"),
         ('a,b\n1,"2', "cannot be read"),
-        (b"a,b\n\xe4,2", "cannot be read .* Save it as UTF-8 text"),
+        (b"a,b\n\xe4,2", "cannot be read .* Save it as UTF-8 text .* Excel calls CSV UTF-8"),
+        (
+            b"PK\x03\x04\x14\x00",
+            r"an archive, such as an Excel workbook \(.xlsx\), but plain text is required",
+        ),
+        (gzip.compress(b"a,b\n1,2"), "the file is compressed with gzip, but plain text is required"),
     ],
 )
 def test_wrong_files_are_refused(tmp_path: Path, content: str | bytes, message: str) -> None:
@@ -63,7 +69,7 @@ def test_wrong_files_are_refused(tmp_path: Path, content: str | bytes, message: 
 def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"none\.csv: no such file; a CSV table is expected"):
         read_columns(tmp_path / "none.csv")
-    with pytest.raises(DataError, match="cannot be read"):
+    with pytest.raises(DataError, match=r"cannot be read as a table, because it is a folder\. Name a file"):
         read_columns(tmp_path)
 
 

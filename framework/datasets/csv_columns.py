@@ -37,6 +37,8 @@ MISSING = frozenset(
 """Words, in small letters, that pandas, R and spreadsheets write into a cell without a number or label."""
 BOOLEANS = {"true": 1.0, "false": 0.0}
 """Numbers as which the words TRUE and FALSE (in small letters) are read."""
+DATE = re.compile(r"\d{4}[-/.]\d{1,2}[-/.]\d{1,2}([T ].*)?|\d{1,2}[-/.]\d{1,2}[-/.](\d{4}|\d\d)([T ].*)?")
+"""Calendar date, perhaps with a time of day, in the usual orders of year, month and day."""
 ENOUGH_ROWS = 20
 """Largest number of rows of a table that is not searched for columns of row numbers or of angles in radians."""
 INDEX = re.compile(
@@ -238,7 +240,12 @@ def csv_rows(file: Path, missing: str, writing: Writing | None = None) -> Iterat
         DataError: the file is missing or unreadable.
     """
     with (
-        translate_errors(file, "a table", "Save it as UTF-8 text with one row on each line.", missing),
+        translate_errors(
+            file,
+            "a table",
+            "Save it as UTF-8 text with one row on each line, which Excel calls CSV UTF-8.",
+            missing,
+        ),
         open_regular(file) as stream,
     ):
         text.remove_byte_order_mark(stream.peek(text.LOOKED_AT))
@@ -494,7 +501,21 @@ def _why_no_numbers(columns: Columns, name: str, setting: str) -> str:
             f"{columns.file} line {line}, column {quote(name)}: {quote(cell)} is a number {mend.form}. "
             f"{remedy(mend, columns.writing)} Or list the columns to read in {setting}, and leave this column out."
         )
+    if all(DATE.fullmatch(cell) for cell, _, _ in words):
+        return "dates; write numbers, such as days since the first date, to read it"
     return f"words; {plain / len(filled):.0%} of the cells are numbers" if plain else "words"
+
+
+def describe_words(columns: Columns, name: str) -> str:
+    """Return what a column without numbers holds, "words such as 'x'" or "dates such as 'x'"; "" if it holds numbers.
+
+    A column also holds numbers if its cells would be numbers in another notation.
+    """
+    notation = columns.notation_of(name)
+    cell = next((cell for cell in columns.cells[name] if cell.lower() not in notation.missing), "")
+    if not cell or mostly_numbers(columns, name) or _other_reading(cell, notation) is not None:
+        return ""
+    return f"{'dates' if DATE.fullmatch(cell) else 'words'} such as {quote(cell)}"
 
 
 def _other_reading(cell: str, writing: Writing) -> text.Suggestion | None:

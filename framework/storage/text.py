@@ -24,6 +24,17 @@ WIDE = (
 )
 LONGEST = 64
 """Largest number of characters of a word that `suggest_number` examines, because its patterns take superlinear time."""
+PACKED = {
+    b"PK\x03\x04": "an archive, such as an Excel workbook (.xlsx)",
+    b"\xd0\xcf\x11\xe0": "a file of an old Office program, such as an Excel workbook (.xls)",
+    b"\x1f\x8b": "compressed with gzip",
+    b"BZh": "compressed with bzip2",
+    b"\xfd7zXZ": "compressed with xz",
+    b"\x28\xb5\x2f\xfd": "compressed with zstd",
+    b"PAR1": "a Parquet table",
+    b"\x89HDF": "an HDF5 file",
+}
+"""First bytes of files that users give where text is required, and what such a file is."""
 LOOKED_AT = 64
 """Number of leading bytes that are searched for UTF-16 without a byte-order mark, in which every second byte is 0."""
 MINUS = str.maketrans(
@@ -66,8 +77,11 @@ def remove_byte_order_mark(content: bytes) -> bytes:
     """Return the bytes of a text, or of a file that begins with text, without the byte-order mark of UTF-8.
 
     Raises:
-        ValueError: The text is UTF-16 or UTF-32.
+        ValueError: The text is UTF-16 or UTF-32, or the file is no text, but a workbook or a compressed file.
     """
+    for start, kind in PACKED.items():
+        if content.startswith(start):
+            raise ValueError(f"the file is {kind}, but plain text is required")
     for mark, name in WIDE:
         if content.startswith(mark):
             raise ValueError(f"the file is text in {name}, but UTF-8 is required. {SAVE}")

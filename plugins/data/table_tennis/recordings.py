@@ -89,7 +89,7 @@ def flights_of(
         recorded = [_to_units(flight, times_in, lengths_in) for flight in _from_matlab(file)]
         return [_check(flight, step, times_in) for flight in recorded]
     columns = read_columns(file, writing)
-    require(columns, COLUMNS, "data.root")
+    require(columns, COLUMNS, f"The layout of a flight ({', '.join(COLUMNS)})")
     times, *positions = (numbers(columns, name, missing="") for name in COLUMNS)
     truth = None
     if all(name in columns.cells for name in TRUE_COLUMNS):

@@ -32,6 +32,7 @@ from plugins.data.tabular.table import (
 )
 
 Share = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)]
+TestShare = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
 
 
 class Tabular(Data):
@@ -47,8 +48,10 @@ class Tabular(Data):
         target: The column to predict, or several columns if they hold numbers.
         kind: Kind of the target: a class label, a real number, or an angle in degrees or radians.
         columns: Columns of the input; None for every other column whose cells are mostly numbers.
-        validation: Share of the rows for validation, chosen at random, if there is no column `split`.
-        test: Share of the rows for the test, chosen at random, if there is no column `split`.
+        validation: Share of the rows for validation, chosen at random, if there is no column `split`; of the training
+            rows, if this column names no row for validation.
+        test: Share of the rows for the test, chosen at random, if there is no column `split`; 1 makes all rows of a
+            table test rows, for a model that was trained on another table.
         data_seed: Seed of the choice of these rows, independent of the seed of the run.
         missing: Treatment of rows without a number or a label. "error" refuses them, "skip" leaves them out.
         small_angles: Whether angles in degrees may all lie within ±2π; by default this is refused, because such angles
@@ -73,7 +76,7 @@ class Tabular(Data):
         kind: Kind = "class",
         columns: list[Words] | None = None,
         validation: Share = 0.15,
-        test: Share = 0.15,
+        test: TestShare = 0.15,
         data_seed: Annotated[int, Field(ge=0, lt=2**31)] = 0,
         missing: Missing = "error",
         small_angles: bool = False,
@@ -116,7 +119,7 @@ class Tabular(Data):
                 f"data.small_angles=true has no effect with data.kind={question.kind}. Leave data.small_angles out, or "
                 "set data.kind=degrees."
             )
-        if question.validation + question.test >= 1:
+        if question.test < 1 <= question.validation + question.test:
             raise DataError(
                 f"data.validation + data.test = {question.validation + question.test:g}, but the sum must be less than "
                 "1 to leave rows for training. Reduce one of them."
@@ -163,9 +166,9 @@ class Tabular(Data):
         return self._trained or self._table.inputs
 
     def state_dict(self) -> Mapping[str, Any]:
-        names, scaling = self._input_columns
-        numbers = {name: array.tolist() for name, array in scaling._asdict().items()}
-        return {"columns": list(names), **numbers}
+        kept = self._input_columns
+        numbers = {name: array.tolist() for name, array in kept.scaling._asdict().items()}
+        return {"columns": list(kept.names), **numbers, "labels": list(kept.labels), "content": kept.content}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         if state:

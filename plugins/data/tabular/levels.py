@@ -35,7 +35,7 @@ def expand_words(cells: Columns, but: Collection[str]) -> tuple[Columns, Mapping
     columns: dict[str, list[str]] = {}
     expanded: dict[str, tuple[str, ...]] = {}
     for name, words in cells.cells.items():
-        levels = sorted(_levels(cells, name)) if reasons.get(name, "").startswith("words") else []
+        levels = sorted(_levels(cells, name)) if reasons.get(name, "").startswith(("words", "dates")) else []
         names = tuple(name_of(name, level) for level in levels)
         if not 2 <= len(levels) <= MOST_LEVELS or any(part in cells.cells for part in names):
             columns[name] = words
@@ -44,6 +44,16 @@ def expand_words(cells: Columns, but: Collection[str]) -> tuple[Columns, Mapping
         for part, level in zip(names, levels, strict=True):
             columns[part] = _indicator(words, level)
     return replace(cells, cells=columns), expanded
+
+
+def explain_many_levels(cells: Columns, left_out: Mapping[str, str]) -> dict[str, str]:
+    """Return the reasons why columns are left out, with the number of words of the columns that have too many."""
+    reasons = dict(left_out)
+    for name, why in left_out.items():
+        count = len(_levels(cells, name)) if why == "words" else 0
+        if count > MOST_LEVELS:
+            reasons[name] = f"{count} different words; at most {MOST_LEVELS} are read"
+    return reasons
 
 
 def add_levels(cells: Columns, names: Sequence[str]) -> Columns:

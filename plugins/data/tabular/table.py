@@ -19,6 +19,7 @@ from framework.datasets.csv_columns import (
     LabelledWriting,
     Writing,
     describe_choice,
+    describe_words,
     is_boolean,
     number,
     numbers,
@@ -33,7 +34,7 @@ from framework.errors import DataError, did_you_mean, quote, shorten
 from framework.storage import text
 from framework.storage.arrays import to_real
 from framework.target import Target
-from plugins.data.tabular.levels import add_levels, expand_words, levels_in_memory
+from plugins.data.tabular.levels import add_levels, expand_words, explain_many_levels, levels_in_memory
 
 Kind = Literal["class", "real", "degrees", "radians"]
 Missing = Literal["error", "skip"]
@@ -89,10 +90,19 @@ class Scaling(NamedTuple):
 
 
 class InputColumns(NamedTuple):
-    """Names and scaling of the columns that are the input."""
+    """Columns that are the input, and what else a model keeps of its training table.
+
+    Attributes:
+        names: Names of the columns.
+        scaling: Scaling of the columns.
+        labels: Classes of the target; () for a target of another kind, or if an older version stored the model.
+        content: Hash of the cells of the training table; "" if an older version stored the model.
+    """
 
     names: tuple[str, ...]
     scaling: Scaling
+    labels: tuple[str, ...] = ()
+    content: str = ""
 
 
 def restore_columns(state: Mapping[str, Any]) -> InputColumns:
@@ -102,7 +112,11 @@ def restore_columns(state: Mapping[str, Any]) -> InputColumns:
         DataError: The state does not hold finite numbers for each column, or a column would be divided by 0.
     """
     names: Sequence[Any] = state["columns"] if isinstance(state.get("columns"), list | tuple) else ()
+    labels: Sequence[Any] = state.get("labels", ())
+    content = state.get("content", "")
     are_names = bool(names) and all(isinstance(name, str) for name in names)
+    are_names &= isinstance(labels, list | tuple) and all(isinstance(label, str) for label in labels)
+    are_names &= isinstance(content, str)
     try:
         scaling = Scaling(*(np.array(state[name], np.float64) for name in Scaling._fields))
     except (KeyError, TypeError, ValueError):
@@ -117,7 +131,7 @@ def restore_columns(state: Mapping[str, Any]) -> InputColumns:
             f"The stored state of tabular must hold {', '.join(Scaling._fields)} of each input column, but holds "
             "something else. Load another checkpoint, or train the model again."
         )
-    return InputColumns(tuple(names), scaling)
+    return InputColumns(tuple(names), scaling, tuple(labels), content)
 
 
 class Table(NamedTuple):
@@ -173,7 +187,9 @@ def load(
     """
     cells = read_columns(file, writing or LabelledWriting())
     cells, question = (cells, question) if arrange is None else arrange(cells, question)
-    digest = hashlib.sha256(repr((cells.cells, question)).encode()).hexdigest()
+    require(cells, question.target, "data.target")
+    content = hashlib.sha256(repr(cells.cells).encode()).hexdigest()
+    digest = hashlib.sha256(repr((content, question)).encode()).hexdigest()
     if trained is not None:
         cells = add_levels(cells, trained.names)
     elif words == "levels":
@@ -182,6 +198,8 @@ def load(
             names = [part for name in question.columns for part in levels.get(name, (name,))]
             question = question._replace(columns=tuple(names))
     choice = _choose_inputs(cells, question) if trained is None else _choose(cells, question, trained.names)
+    if words == "levels":
+        choice = choice._replace(left_out=explain_many_levels(cells, choice.left_out))
     columns = choice.names
     require(cells, columns, "The trained model")
     skip_remedy = "set data.missing=skip to leave such rows out" if question.missing == "error" else None
@@ -191,11 +209,17 @@ def load(
     complete = ~(np.isnan(inputs).any(-1) | absent)
     rows = np.flatnonzero(complete)
     groups, group = _groups(file, cells, rows)
-    split = _splits(cells, rows, question)
+    split, remarks = _splits(cells, rows, values, question, trained, content)
     training = rows[split == 0]
-    scaling, constant = fit_scaling(inputs[training])
+    fitted_rows = (
+        training if len(training) else rows
+    )  # a table for the test of a trained model has no training rows
+    scaling, constant = fit_scaling(inputs[fitted_rows])
     scaling = scaling if trained is None else trained.scaling
-    target, encoded = _encode(cells, rows, training, values, question)
+    labels = () if trained is None else trained.labels
+    target, encoded = _encode(cells, rows, fitted_rows, values, question, labels)
+    if target.kind == "real" and trained is None:
+        remarks += _constant_targets(question.target, values[training])
     scaled = as_float32(cells, columns, rows, standardise(inputs[rows], scaling))
     lines = torch.tensor(cells.lines)[torch.from_numpy(rows)]
     parts = {}
@@ -214,14 +238,14 @@ def load(
     )
     return Table(
         target,
-        InputColumns(columns, scaling),
+        InputColumns(columns, scaling, target.names if target.kind == "class" else (), content),
         constant_names,
         groups,
         Splits(**parts),
         sizes,
         len(complete) - len(rows),
         digest,
-        describe_choice(choice),
+        (*describe_choice(choice), *remarks),
     )
 
 
@@ -344,7 +368,6 @@ def as_float32(
 
 def _choose_inputs(cells: Columns, question: Question) -> ColumnChoice:
     """Return the input columns: those that the settings name, or all columns of numbers."""
-    require(cells, question.target, "data.target")
     if question.columns is not None:
         require(cells, question.columns, "data.columns")
         columns = tuple(dict.fromkeys(question.columns))
@@ -390,6 +413,13 @@ def _targets(cells: Columns, question: Question, skip_remedy: str | None) -> tup
                 raise DataError(
                     f"{cells.file}, column {name!r}: The column holds two words such as {cells.cells[name][0]!r}, but "
                     f"data.kind={question.kind} requires numbers. Set data.kind=class, or name another data.target."
+                )
+            if words := describe_words(cells, name):
+                raise DataError(
+                    f"{cells.file}, column {name!r}: The column holds {words}, but data.kind={question.kind} requires "
+                    "numbers. To predict the words as classes, use experiment=tabular/classification, or set "
+                    "data.kind=class and a density head for classes. To predict numbers, write numbers into the "
+                    "column, or name another data.target."
                 )
         values = np.stack([numbers(cells, name, missing=skip_remedy) for name in question.target], -1)
         return values, np.asarray(np.isnan(values).any(-1))
@@ -445,40 +475,144 @@ def _groups(file: Path, cells: Columns, rows: np.ndarray) -> tuple[tuple[str, ..
     return tuple(groups), torch.tensor([indices[word] for word in words], dtype=torch.int64)
 
 
-def _splits(cells: Columns, rows: np.ndarray, question: Question) -> Int[np.ndarray, "row"]:
-    """Return the split of each row, as an index into SPLITS.
+def _splits(
+    cells: Columns,
+    rows: np.ndarray,
+    values: np.ndarray,
+    question: Question,
+    trained: InputColumns | None,
+    content: str,
+) -> tuple[Int[np.ndarray, "row"], tuple[str, ...]]:
+    """Return the split of each row, as an index into SPLITS, and remarks on the choice.
 
-    The column `split` determines the split. Without that column the rows are divided at random.
+    The column `split` determines the split; without a row for validation, a share of the training rows is chosen.
+    Without that column the rows are divided at random, but each class keeps a training row.
+
+    Args:
+        cells: The table.
+        rows: Indices of the rows that are used.
+        values: Targets of all rows.
+        question: The settings of the data set.
+        trained: Input columns of a trained model; None for a training. A table for the test of a trained model needs no
+            rows of other splits.
+        content: Hash of the cells.
     """
+    random = np.random.default_rng(question.data_seed)
+    remarks: tuple[str, ...] = ()
     if SPLIT in cells.cells:
-        for row, word in enumerate(cells.cells[SPLIT]):
-            if word not in SPLITS:
-                raise DataError(
-                    f"{cells.file} line {cells.lines[row]}, column `{SPLIT}`: {word!r} is not a split. Write one of "
-                    f"{', '.join(SPLITS)}.{did_you_mean(word, SPLITS)}"
-                )
-        split = np.array([SPLITS.index(cells.cells[SPLIT][row]) for row in rows], dtype=np.int64)
+        split = _stated_splits(cells, rows)
+        if question.test == 1:
+            raise DataError(
+                f"data.test=1 has no effect, because the column `{SPLIT}` of {cells.file} assigns each row to a split. "
+                "Leave data.test out."
+            )
+        training = np.flatnonzero(split == 0)
+        if len(training) and not (split == 1).any():
+            split[random.permutation(training)[: round(question.validation * len(training))]] = 1
+            remarks = (
+                f"the column `{SPLIT}` names no row for validation: {(split == 1).sum()} of {len(training)} training "
+                f"rows are, data.validation={question.validation:g}",
+            )
         remedy = f"Assign rows to this split in the column `{SPLIT}`."
+    elif question.test == 1:
+        if trained is None or trained.content == content:
+            which = "the model was trained on this table" if trained else "there is no trained model"
+            raise DataError(
+                f"{cells.file}: data.test=1 makes all rows test rows, but {which}. Leave data.test out, or use it with "
+                "mode=test, checkpoint=<run folder> and another table."
+            )
+        split, remedy = np.full(len(rows), 2), "Add rows."
     else:
         split = np.zeros(len(rows), dtype=np.int64)
-        order = np.random.default_rng(question.data_seed).permutation(len(rows))
+        order = random.permutation(len(rows))
         validation, test = (round(share * len(rows)) for share in (question.validation, question.test))
         split[order[:validation]] = 1
         split[order[validation : validation + test]] = 2
+        is_other_table = trained is not None and trained.content not in ("", content)
+        if question.kind == "class" and not is_other_table:
+            remarks = _keep_training_rows(split, values[rows])
+        if is_other_table:
+            remarks = (
+                f"{cells.file.name} is not the training table: {(split == 2).sum()} of its {len(rows)} rows, chosen at "
+                "random, are the test split; data.test=1 makes all of them test rows",
+            )
         remedy = f"Add rows, change data.validation and data.test, or add a column `{SPLIT}`."
     for index, name in enumerate(SPLITS):
-        if not (split == index).any():
+        if not (split == index).any() and (trained is None or name == "test"):
+            absent = len(cells.lines) - len(rows)
+            without = f", {absent} are left out, because a number or a label is missing" if absent else ""
             raise DataError(
-                f"{cells.file}: The {name} split is empty ({len(rows)} rows are used, {len(cells.lines) - len(rows)} "
-                f"are left out, because a number or a label is missing). {remedy}"
+                f"{cells.file}: The {name} split is empty ({len(rows)} rows are used{without}). {remedy}"
             )
-    return split
+    return split, remarks
+
+
+def _stated_splits(cells: Columns, rows: np.ndarray) -> Int[np.ndarray, "row"]:
+    """Return the split of each row that is used, from the column `split`."""
+    for row, word in enumerate(cells.cells[SPLIT]):
+        if word not in SPLITS:
+            raise DataError(
+                f"{cells.file} line {cells.lines[row]}, column `{SPLIT}`: {word!r} is not a split. Write one of "
+                f"{', '.join(SPLITS)}.{did_you_mean(word, SPLITS)}"
+            )
+    return np.array([SPLITS.index(cells.cells[SPLIT][row]) for row in rows], dtype=np.int64)
+
+
+def _keep_training_rows(split: Int[np.ndarray, "row"], labels: np.ndarray) -> tuple[str, ...]:
+    """Move the first row of each class without a training row to the training split; return a remark about them.
+
+    `split` is changed in place. Nothing is moved if the labels may not be meant as classes: more than two numbers, or
+    very many words.
+    """
+    names = set(labels.tolist())
+    are_numbers = all(text.parse_number(name) is not None for name in names)
+    if len(names) > (2 if are_numbers else _most_classes(len(labels))):
+        return ()
+    lacking = sorted(names - set(labels[split == 0].tolist()), key=_order)
+    for label in lacking:
+        split[np.flatnonzero(labels == label)[0]] = 0
+    if not lacking:
+        return ()
+    listed = shorten(", ".join(map(quote, lacking)), 200)
+    return (f"one row of each of these rare classes was moved to the training split: {listed}",)
+
+
+def _most_classes(rows: int) -> float:
+    """Return the largest number of different labels that are accepted as classes in a table of `rows` rows."""
+    return max(MANY_LABELS, rows / 2)
+
+
+def _constant_targets(names: Sequence[str], training_values: np.ndarray) -> tuple[str, ...]:
+    """Return a remark about targets that have the same value in all training rows."""
+    constant = [
+        f"{quote(name)} is {column[0]:g} in all training rows, so that nothing can be learned about it"
+        for name, column in zip(names, training_values.T, strict=True)
+        if column.min() == column.max()
+    ]
+    return tuple(constant)
 
 
 def _encode(
-    cells: Columns, rows: np.ndarray, training: np.ndarray, values: np.ndarray, question: Question
+    cells: Columns,
+    rows: np.ndarray,
+    training: np.ndarray,
+    values: np.ndarray,
+    question: Question,
+    known_labels: tuple[str, ...],
 ) -> tuple[Target, Tensor]:
-    """Return the description of the target, and the targets of the rows as a batch holds them."""
+    """Return the description of the target, and the targets of the rows as a batch holds them.
+
+    Args:
+        cells: The table.
+        rows: Indices of the rows that are used.
+        training: Indices of the training rows.
+        values: Targets of all rows.
+        question: The settings of the data set.
+        known_labels: Classes of a trained model; () for the labels of this table.
+
+    Raises:
+        DataError: The targets do not fit the kind, or a label is not a class of the trained model.
+    """
     if question.kind == "real":
         as_float32(cells, question.target, rows, values[rows])  # refuses numbers beyond single precision
         training_values = values[training]
@@ -494,10 +628,29 @@ def _encode(
         return Target("angle", question.target), angle.float()
     if question.kind == "radians":
         return Target("angle", question.target), wrap(torch.from_numpy(values[rows])).float()
+    if known_labels:
+        _check_known(cells, known_labels, rows, values, question.target[0])
+        indices = {label: index for index, label in enumerate(known_labels)}
+        return Target("class", known_labels), torch.tensor([indices[str(values[row])] for row in rows])
     labels = sorted(set(values[rows]), key=_order)
     _check_labels(cells, labels, rows, training, values, question.target[0])
     indices = {label: index for index, label in enumerate(labels)}
     return Target("class", tuple(labels)), torch.tensor([indices[values[row]] for row in rows])
+
+
+def _check_known(
+    cells: Columns, known_labels: Sequence[str], rows: np.ndarray, values: np.ndarray, name: str
+) -> None:
+    """Refuse a label that is not a class of the trained model; the message names the first such line."""
+    known = set(known_labels)
+    for row in rows:
+        label = str(values[row])
+        if label not in known:
+            raise DataError(
+                f"{cells.file} line {cells.lines[row]}, column {name!r}: The model does not know the class "
+                f"{label!r}.{did_you_mean(label, known_labels)} Its classes are "
+                f"{shorten(', '.join(known_labels))}. Write one of them, or leave the row out."
+            )
 
 
 def _check_labels(
@@ -522,10 +675,12 @@ def _check_labels(
     numeric_values = [text.parse_number(label) for label in labels]
     numeric = all(value is not None for value in numeric_values)
     fractional = any(value is not None and not value.is_integer() for value in numeric_values)
-    if numeric and len(labels) > (MANY_LABELS if fractional else max(MANY_LABELS, len(rows) / 2)):
+    if len(labels) > (MANY_LABELS if numeric and fractional else _most_classes(len(rows))):
         raise DataError(
-            f"{cells.file}, column {name!r}: {len(labels)} different numbers in {len(rows)} rows are not classes. Set "
-            "data.kind=real or data.kind=degrees, or name another data.target."
+            f"{cells.file}, column {name!r}: {len(labels)} different {'numbers' if numeric else 'labels'} in "
+            f"{len(rows)} rows are not classes. "
+            + ("Set data.kind=real or data.kind=degrees, or name" if numeric else "Name")
+            + " another data.target."
         )
     spelling: dict[float, str] = {}
     for label, value in zip(labels, numeric_values, strict=True):

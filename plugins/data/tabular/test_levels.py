@@ -35,7 +35,7 @@ def rows_of(data, split):
 def test_each_word_has_a_column(tmp_path):
     data = prepared(tmp_path, TABLE)
     assert data.columns == ("x", "colour=blue", "colour=green", "colour=red")
-    assert any("'name' (words)" in remark for remark in data.remarks)
+    assert any("'name' (90 different words; at most 50 are read)" in remark for remark in data.remarks)
     training = rows_of(data, "train")
     assert ((training[:, 1:] > 0).sum(1) == 1).all()
     torch.testing.assert_close(training.mean(0), torch.zeros(4), atol=1e-5, rtol=0)

@@ -180,13 +180,17 @@ def with_cell(cell: str, line: int = 5, column: int = 0) -> str:
             r"line 9, column 'class': The label is missing\. Write a label, or set data\.missing=skip",
         ),
         ("x,class\n" + "1,a\n" * 9, "All rows have the label 'a', but at least two classes"),
-        (with_cell("c", 4, 2), r"line 4, column 'class': No training row has the label 'c'"),
+        (
+            "x,class\n" + "\n".join(f"{row},name {row}" for row in range(50)),
+            "50 different labels in 50 rows are not",
+        ),
         (
             "x,class\n" + "\n".join(f"{row},{row / 7}" for row in range(50)),
             r"50 different numbers in 50 rows are not classes\. Set data\.kind=real",
         ),
-        ("x,class\n1,a\n2,b", r"The validation split is empty \(2 rows are used, 0 are left out"),
+        ("x,class\n1,a\n2,b", r"The validation split is empty \(2 rows are used\)\. Add rows"),
         ("split,x,class\ntrain,1,a\ntest,2,b", r"The validation split is empty .* column `split`"),
+        ("x,Class\n1,a\n2,b", r"data\.target names the column 'class', .* Did you mean 'Class'\?"),
         (
             "split,x,class\ntrain,1,a\ntset,2,b",
             r"line 3, column `split`: 'tset' is not a split\. .* Did you mean 'test'\?",
@@ -213,14 +217,99 @@ def with_cell(cell: str, line: int = 5, column: int = 0) -> str:
 )
 def test_wrong_tables_are_refused(tmp_path: Path, text: str, message: str) -> None:
     file = table(tmp_path, text)
-    # a seed that puts lines 3 and 4 into the test split
-    seed = next(
-        seed
-        for seed in count()
-        if {1, 2} <= set(np.random.default_rng(seed).permutation(ROWS)[6:12].tolist())
-    )
     with pytest.raises(DataError, match=message):
-        prepare_data(file, data_seed=seed)
+        prepare_data(file)
+
+
+@pytest.mark.parametrize(
+    ("cells", "words"),
+    [("2024-05-01", "dates"), ("1.5.2024", "dates"), ("high", "words"), ("3 or 4", "words")],
+)
+def test_a_column_without_numbers_is_no_real_target(tmp_path: Path, cells: str, words: str) -> None:
+    file = table(tmp_path, "x,y\n" + f"1,{cells}\n" * 30)
+    with pytest.raises(DataError, match=f"column 'y': The column holds {words} such as '{cells}'"):
+        prepare_data(file, target="y", kind="real")
+
+
+def test_every_class_keeps_a_training_row(tmp_path: Path) -> None:
+    text = with_cell("c", 4, 2)
+    # a seed that puts line 4 into the test split
+    seed = next(seed for seed in count() if 2 in np.random.default_rng(seed).permutation(ROWS)[6:12].tolist())
+    data = prepare_data(table(tmp_path, text), data_seed=seed)
+    assert data.target.names == ("a", "b", "c")
+    assert fields_of(data, "train")["line"][fields_of(data, "train")["target"] == 2].tolist() == [4]
+    assert any("moved to the training split: 'c'" in remark for remark in data.remarks)
+    others = prepare_data(table(tmp_path, with_cell("a", 4, 2)), data_seed=seed)
+    lines = [set(fields_of(either, "train")["line"].tolist()) for either in (data, others)]
+    assert lines[0] - lines[1] == {4}
+
+
+def test_without_rows_for_validation_a_share_of_the_training_rows_is_chosen(tmp_path: Path) -> None:
+    text = "split,x,class\n" + "\n".join(
+        f"{'test' if row % 4 == 0 else 'train'},{row},{'ab'[row % 2]}" for row in range(40)
+    )
+    data = prepare_data(table(tmp_path, text), validation=0.2)
+    lines = {name: fields_of(data, name)["line"].numpy() - 2 for name in SPLITS}
+    assert [len(lines[name]) for name in SPLITS] == [24, 6, 10]
+    assert sorted(lines["test"]) == list(range(0, 40, 4))
+    assert len(np.unique(np.concatenate([*lines.values()]))) == 40
+    assert any("6 of 30 training rows are, data.validation=0.2" in remark for remark in data.remarks)
+
+
+def test_a_trained_model_is_tested_on_all_rows_of_another_table(tmp_path: Path) -> None:
+    trained = prepare_data(table(tmp_path), columns=["number"])
+    state = dict(trained.state_dict())
+    (tmp_path / "other").mkdir()
+
+    def prepare_other(text: str, **config: Any) -> Tabular:
+        data = build_data(table(tmp_path / "other", text), columns=["number"], **config)
+        data.load_state_dict(state)
+        data.prepare()
+        return data
+
+    rows = [f"{row},{('cat', 'dog')[row % 2]}" for row in range(20)]  # no row of the third class
+    for text, config in (
+        ("\n".join(["number,class", *rows]), {"test": 1}),
+        ("\n".join(["split,number,class", *(f"test,{row}" for row in rows)]), {}),
+    ):
+        data = prepare_other(text, **config)
+        assert data.target == trained.target
+        assert [len(fields_of(data, name)["line"]) for name in SPLITS] == [0, 0, 20]
+        assert fields_of(data, "test")["target"].tolist() == [0, 1] * 10
+        expected = fields_of(trained, "train")
+        slope, start = np.polyfit(expected["line"] - 2, expected["input"][:, 0], 1)
+        np.testing.assert_allclose(
+            fields_of(data, "test")["input"][:, 0], start + slope * np.arange(20), atol=1e-5
+        )
+    part = prepare_other("\n".join(["number,class", *rows]))
+    assert len(fields_of(part, "test")["line"]) == 3
+    assert any(
+        "3 of its 20 rows, chosen at random, are the test split; data.test=1" in x for x in part.remarks
+    )
+    with pytest.raises(DataError, match=r"line 22, column 'class': The model does not know the class 'bird'"):
+        prepare_other("\n".join(["number,class", *rows, "3,bird"]))
+    with pytest.raises(DataError, match=r"data\.test=1 has no effect, because the column `split`"):
+        prepare_other("\n".join(["split,number,class", *(f"test,{row}" for row in rows)]), test=1)
+    with pytest.raises(DataError, match="The test split is empty"):
+        prepare_other("\n".join(["split,number,class", *(f"train,{row}" for row in rows)]))
+    same = build_data(table(tmp_path), columns=["number"])
+    same.load_state_dict(state)
+    same.prepare()
+    assert not any("training table" in remark for remark in same.remarks)
+    assert same.fingerprint() == trained.fingerprint()
+    refused = build_data(table(tmp_path), columns=["number"], test=1)
+    refused.load_state_dict(state)
+    with pytest.raises(DataError, match="the model was trained on this table"):
+        refused.prepare()
+    with pytest.raises(DataError, match="there is no trained model"):
+        prepare_data(table(tmp_path), test=1)
+
+
+def test_a_constant_target_is_reported(tmp_path: Path) -> None:
+    data = prepare_data(table(tmp_path), target=["same", "real"], kind="real")
+    assert [remark for remark in data.remarks if "nothing can be learned" in remark] == [
+        "'same' is 7 in all training rows, so that nothing can be learned about it"
+    ]
 
 
 def test_missing_words_determine_which_words_are_labels(tmp_path: Path) -> None:
@@ -274,7 +363,9 @@ def test_settings_that_do_not_fit_the_table_are_refused(tmp_path: Path) -> None:
         prepare_data(file, columns=["number", "class"])
     with pytest.raises(DataError, match=r"line 2, column 'word': 'a' is not a finite number"):
         prepare_data(file, columns=["word"])
-    with pytest.raises(DataError, match=r"line 2, column 'class': 'cat' is not a finite number"):
+    with pytest.raises(
+        DataError, match=r"'class': The column holds words such as 'cat', .*experiment=tabular/classification"
+    ):
         prepare_data(file, kind="real")
     with pytest.raises(DataError, match=r"data\.target = \['class', 'word'\] does not fit data\.kind=class"):
         prepare_data(file, target=["class", "word"])
