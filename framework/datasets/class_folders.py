@@ -99,9 +99,9 @@ def list_files(root: Path, suffixes: Collection[str], fewest: int = 2) -> FileLi
         folders_of_class = [(path.name, split, path / split) for path in folders for split in splits]
     classes = sorted({name for name, _, _ in folders_of_class})
     if len(classes) < fewest:
-        found = f"only the class {classes[0]}" if classes else "no folder"
+        content = f"only the class {classes[0]}" if classes else "no folder"
         raise DataError(
-            f"data.root = {root} holds {found}, but folders of at least {fewest} classes are required. {remedy}"
+            f"data.root = {root} holds {content}, but folders of at least {fewest} classes are required. {remedy}"
         )
     folders_of_class.sort(key=lambda entry: (entry[1], entry[0]))
     return collect(classes, folders_of_class, suffixes, "file that can be read", remedy)

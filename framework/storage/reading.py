@@ -48,7 +48,9 @@ def translate_errors(
                 f"{file}: no such file; {missing or f'expected {expected}. Correct the path.'}"
             ) from None
         if isinstance(error, IsADirectoryError):
-            raise kind(f"{file}: cannot be read as {expected}, because it is a folder. Name a file.") from None
+            raise kind(
+                f"{file}: cannot be read as {expected}, because it is a folder. Name a file."
+            ) from None
         why = shorten(error) or type(error).__name__
         raise kind(f"{file}: cannot be read as {expected} ({why}). {remedy}") from error
 

@@ -166,9 +166,12 @@ class Tabular(Data):
         return self._trained or self._table.inputs
 
     def state_dict(self) -> Mapping[str, Any]:
-        kept = self._input_columns
-        numbers = {name: array.tolist() for name, array in kept.scaling._asdict().items()}
-        return {"columns": list(kept.names), **numbers, "labels": list(kept.labels), "content": kept.content}
+        names, scaling, labels, content = self._input_columns
+        numbers = {name: array.tolist() for name, array in scaling._asdict().items()}
+        # a model that an older version stored has neither labels nor the hash of a table
+        optional = {"labels": list(labels)} if labels else {}
+        optional |= {"content": content} if content else {}
+        return {"columns": list(names), **numbers, **optional}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         if state:

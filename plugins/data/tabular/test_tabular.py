@@ -305,6 +305,14 @@ def test_a_trained_model_is_tested_on_all_rows_of_another_table(tmp_path: Path) 
         prepare_data(table(tmp_path), test=1)
 
 
+@pytest.mark.parametrize("wrong", [{"labels": "ab"}, {"labels": [1]}, {"labels": None}, {"content": 3}])
+def test_stored_labels_are_checked(tmp_path: Path, wrong: dict[str, Any]) -> None:
+    state = prepare_data(table(tmp_path)).state_dict()
+    assert state["labels"] == ["cat", "dog", "emu"]
+    with pytest.raises(DataError, match="The stored state of tabular"):
+        build_data(table(tmp_path)).load_state_dict({**state, **wrong})
+
+
 def test_a_constant_target_is_reported(tmp_path: Path) -> None:
     data = prepare_data(table(tmp_path), target=["same", "real"], kind="real")
     assert [remark for remark in data.remarks if "nothing can be learned" in remark] == [
