@@ -28,6 +28,11 @@ RESULTS = ("benchmarks/**/*.md", "reproduction/**/*.md", "tests/fuzz/*.md")
 OTHERS = ("CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md")
 LINK = re.compile(r"(!?\[(?:[^\[\]]|\[[^\[\]]*\])*\]\()([^)\s#]*)(#[^)\s]*)?(\))")
 ITEM = re.compile(r"\s*(?:[-*+]|\d+\.) ")
+BOOSTS = {
+    **dict.fromkeys(("benchmarks/", "reproduction/", "tests/", "CHANGELOG"), 0.3),
+    **dict.fromkeys(("methods/", "reference/"), 1.0),
+}
+"""Weights of pages in the results of a search, by the beginning of their paths; other pages have the weight 3."""
 WIDE = re.compile(r"(?m)^\|(?:[ :-]+\|){8,}$")
 """Line below the heading of a table with at least eight columns."""
 
@@ -205,6 +210,8 @@ def on_page_markdown(markdown: str, page: "Page", config: "MkDocsConfig", files:
         if f"docs/{target}" in map(str, tutorials()):
             markdown += f"\n[Download this page as a notebook]({Path(target).stem}.ipynb)\n"
         markdown = markdown.replace("<!-- results -->", translate(results(), "README.md", target)[0])
+    boosts = [boost for beginning, boost in BOOSTS.items() if target.startswith(beginning)]
+    page.meta["search"] = {"boost": boosts[0] if boosts else 3.0}
     if WIDE.search(markdown):
         page.meta["hide"] = ["toc"]  # its column gives the tables a third more width
     return spaced_lists(markdown)
