@@ -31,7 +31,7 @@ READMES = [
 FOLDERS = cache(composition.config_folders)
 """Found once for all commands."""
 MODULES = ("benchmarks.", "reproduction.")
-NOT_OURS = ("=mine", "=[mine]", "=my_laplace", "=theirs", "X=", "resume=", "--")
+NOT_OURS = ("=mine", "=[my_metric]", "=my_laplace", "=theirs", "X=", "resume=", "--")
 """Parts of commands that stand for a reader's own plugin, take their config from a run folder, or compose nothing."""
 
 

@@ -86,6 +86,40 @@ def test_every_setting_of_every_plugin_has_a_meaning_on_its_page(site: ModuleTyp
     assert not [key for key, values, *_ in rows if values.startswith(("<", "typing."))]
 
 
+def known_settings(site: ModuleType) -> set[str]:
+    """Return all settings with a dot in their names, of the framework, its plugins and the engines of sweeps."""
+    pages, tables = sys.modules["method_pages"], sys.modules["setting_tables"]
+    known = {"hydra.run.dir", "hydra.sweep.dir"}
+    known |= {key for key in re.findall(r"(?m)^\| `([\w.]+)` \|", tables.settings_page()) if "." in key}
+    for entry in site.entries():
+        prefix = entry.group + f".{entry.name}" * (entry.group in pages.SEVERAL)
+        known |= {f"{prefix}.{row.key}" for row in pages.settings_of(entry, load(entry.group, entry.name))}
+    for kind in ("launcher", "sweeper"):
+        for file in (ROOT / "conf/hydra" / kind).glob("*.yaml"):
+            known |= {f"hydra.{kind}.{key}" for key in yaml.safe_load(file.read_text(encoding="utf-8"))}
+    return known
+
+
+def test_every_setting_that_a_page_names_exists(site: ModuleType) -> None:
+    """test_readmes.py composes whole commands; this test reads single settings in the text, too."""
+    known = known_settings(site)
+    named = {
+        (path, setting)
+        for path in [*DOCUMENTS, *ROOT.glob("plugins/*/*/README.md")]
+        for code in re.findall(r"(?ms)^ *```\w*\n.*?^ *```$|`[^`\n]+`", path.read_text(encoding="utf-8"))
+        for setting in re.findall(r"(?<![\w./@{=-])([a-z_]+(?:\.[a-z0-9_]+)+)=(?!=)", code)
+    }
+    assert len(named) > 200
+    parts = re.compile(r"\.(?:component|renderer)\.\w+$")  # settings of a plugin that another one contains
+    unknown = [
+        f"{path.relative_to(ROOT)}: {setting}"
+        for path, setting in sorted(named)
+        if setting not in known
+        and not (setting.startswith(("encoder.", "density_head.")) and parts.search(setting))
+    ]
+    assert not unknown, "\n".join(unknown)
+
+
 @pytest.mark.parametrize("tutorial", TUTORIALS, ids=lambda path: path.stem)
 def test_a_tutorial_is_a_notebook_and_shows_the_outputs_of_a_run(site: ModuleType, tutorial: Path) -> None:
     text = tutorial.read_text(encoding="utf-8")
