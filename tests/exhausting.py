@@ -318,6 +318,11 @@ def matlab(name: bytes, shape: tuple[int, int], content: bytes) -> bytes:
     return struct.pack("<II", 15, len(packed)) + packed
 
 
+def icon(picture: bytes) -> bytes:
+    """Return an icon with one image, which is larger than the directory says."""
+    return struct.pack("<HHHBBBBHHII", 0, 1, 1, 0, 0, 0, 0, 1, 32, len(picture), 22) + picture
+
+
 def idx(*shape: int) -> bytes:
     """Return a packed idx file of zeros."""
     header = bytes([0, 0, 8, len(shape)]) + b"".join(side.to_bytes(4, "big") for side in shape)
@@ -448,6 +453,7 @@ def bombs() -> dict[str, tuple[Callable[[], bytes], Callable[[Path], object]]]:
         "tiles larger than the image.tif": (lambda: tiled(32_768), shown),
         "many scans.jpg": (lambda: scanned(8000), shown),
         "a GIF.gif": (lambda: image("P", (side, side), "GIF"), shown),
+        "an icon.ico": (lambda: icon(plain_png(13_000, 13_000)), shown),
         "no marker.jpg": (lambda: b"\xff\xd8" + b"\xff" * 4_000_000, shown),
         "pixels/images-idx3-ubyte.gz": (
             lambda: idx(bytes_in_all, 1, 1),

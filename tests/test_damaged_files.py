@@ -3,6 +3,7 @@
 import ast
 import os
 import pickle
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -136,6 +137,21 @@ def test_images_of_too_many_pixels_are_refused_before_they_are_decoded(
     Image.new("1", size).save(tmp_path / "one.png")
     with pytest.raises(DataError, match=r"one\.png: .*pixels; at most .* Scale the image down"):
         Crop(tmp_path / "one.png", None, 0.0, 16).check()
+
+
+@pytest.mark.parametrize("kind", ["png", "bmp"])
+def test_icons_are_read_and_their_large_images_refused(kind: str, tmp_path: Path) -> None:
+    file = tmp_path / "one.ico"
+    Image.new("RGB", (32, 32), (9, 99, 200)).save(file, bitmap_format=kind, sizes=[(16, 16), (32, 32)])
+    pixels = Crop(file, None, 0.0, 16).read()
+    assert (pixels == np.array([9, 99, 200]).reshape(3, 1, 1)).all()
+    content = file.read_bytes()
+    start = int.from_bytes(content[6 + 16 + 12 : 6 + 16 + 16], "little")
+    sides = struct.pack(">II", 3000, 1400) if kind == "png" else struct.pack("<ii", 3000, -1400)
+    place = start + (16 if kind == "png" else 4)
+    file.write_bytes(content[:place] + sides + content[place + 8 :])
+    with pytest.raises(DataError, match=r"one\.ico: .*the icon holds an image of 3000 x -?1400 pixels"):
+        Crop(file, None, 0.0, 16).read()
 
 
 def test_an_image_that_another_program_would_decode_is_refused(tmp_path: Path) -> None:

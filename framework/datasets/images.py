@@ -4,6 +4,7 @@ import itertools
 import math
 import os
 import re
+import struct
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -28,6 +29,7 @@ from framework.storage import reading
 from framework.storage.limits import (
     AT_ONCE,
     LONGEST_SIDE,
+    MOST_ICON,
     MOST_PADDED,
     MOST_PIXELS,
     MOST_PIXELS_OF,
@@ -175,9 +177,10 @@ def open_stream(stream: BinaryIO | BytesIO) -> Iterator[Image.Image]:
 
     Raises:
         ValueError: the image has more pixels than `MOST_PIXELS_OF` and `LONGEST_SIDE` allow, tiles of so many pixels,
-            or more than `MOST_SCANS` scans.
+            or more than `MOST_SCANS` scans; or the file is an icon with an image of more than `MOST_ICON` pixels.
         Exception: the content is not an image, or damaged.
     """
+    _require_bounded_icon(stream)
     try:
         opened = Image.open(stream, formats=FORMATS)
     except UnidentifiedImageError:
@@ -191,6 +194,32 @@ def open_stream(stream: BinaryIO | BytesIO) -> Iterator[Image.Image]:
             )
         _require_bounded_decoding(image, stream, most)
         yield image
+
+
+def _require_bounded_icon(stream: BinaryIO | BytesIO) -> None:
+    """Refuse an icon (ICO) that holds an image of many pixels, which Pillow decodes as soon as it opens the file.
+
+    The directory of the file states at most 256 pixels along a side, but the image itself may be larger.
+
+    Raises:
+        ValueError: an image has more than `MOST_ICON` pixels.
+    """
+    start = stream.tell()
+    head = stream.read(6)
+    if head[:4] == b"\0\0\1\0":
+        directory = stream.read(16 * int.from_bytes(head[4:], "little"))
+        for entry in range(0, len(directory) - 15, 16):
+            stream.seek(start + int.from_bytes(directory[entry + 12 : entry + 16], "little"))
+            content = stream.read(24)
+            of_png = content.startswith(b"\x89PNG")
+            sides = struct.unpack(">II", content[16:24]) if of_png and len(content) == 24 else ()
+            if not of_png and len(content) >= 12:  # a bitmap, which counts the rows of its mask too
+                sides = struct.unpack("<ii", content[4:12])
+            if abs(math.prod(sides)) > MOST_ICON:
+                raise ValueError(
+                    f"the icon holds an image of {' x '.join(map(str, sides))} pixels; at most {MOST_ICON} are allowed"
+                )
+    stream.seek(start)
 
 
 def _require_bounded_decoding(image: Image.Image, stream: BinaryIO | BytesIO, most: int) -> None:

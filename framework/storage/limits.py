@@ -58,6 +58,8 @@ this memory twice.
 """
 MOST_PIXELS_OF = {"WEBP": 2**25, "JPEG2000": 2**25, "AVIF": 2**25}
 """Largest number of pixels in formats whose decoders create two or three further copies of the image."""
+MOST_ICON = 2**22
+"""Largest number of pixels of an image in an icon (ICO); programs write at most 1024 × 1024."""
 MOST_SCANS = 100
 """Largest number of scans of a JPEG image, as in libtiff (LIBTIFF_JPEG_MAX_ALLOWED_SCAN_NUMBER); programs write ten.
 
