@@ -157,11 +157,6 @@ class Soak:
         folder.mkdir(parents=True, exist_ok=True)
         self.state = State.load(folder / "state.json")
         self.earlier = [counts for counts in read_tests(RECORD) if counts.began != self.state.began]
-        describe = ["git", "describe", "--always", "--dirty", "--exclude=*"]
-        commit = subprocess.run(describe, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
-        self.state.machine = environment("torch", "pytorch-lightning", "hydra-core", "mlflow", "ray")
-        if commit not in self.state.commits:
-            self.state.commits.append(commit)
         if not (folder / "inputs").is_dir():
             partial = folder / "inputs.partial"
             shutil.rmtree(partial, ignore_errors=True)
@@ -233,6 +228,11 @@ class Soak:
         write_whole(self.folder / "state.json", json.dumps(asdict(self.state), indent=1).encode())
 
     def _note(self, name: str, number: int, faults: list[str], folder: Path) -> None:
+        describe = ("git", "describe", "--always", "--dirty", "--exclude=*")
+        commit = subprocess.run(describe, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+        if commit not in self.state.commits:
+            self.state.commits.append(commit)
+        self.state.machine = environment("torch", "pytorch-lightning", "hydra-core", "mlflow", "ray")
         self.state.faults += [f"{name} {number}: {fault}" for fault in faults[:5]]
         self._save()
         if not faults:
