@@ -129,8 +129,9 @@ def _draw_in_processes(count: int, draw: Callable[[int], Result], work: str) -> 
             sending.close()  # so that the end of the process ends the pipe
         own = range(1, count, PAINTERS)
         results = {0: first}
-        sizes = {number: min(PAINTERS, count - number) for number in own}
-        for number in track_progress(own, work, count - 1, "files", sizes.__getitem__):
+        # the files that the other processes have drawn meanwhile, and the first one
+        sizes = {number: min(PAINTERS, count - number) + (number == 1) for number in own}
+        for number in track_progress(own, work, count, "files", sizes.__getitem__):
             results[number] = draw(number)
         for receiving, _ in pipes:
             try:
