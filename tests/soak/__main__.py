@@ -307,7 +307,7 @@ RAY_NOTE = (
     "moments, three left these agents for 15, 17 and 80 s on a busy machine, and no other process. Since then, "
     "`framework.sweeps.ray_guard` ends them: after three kills at the same moments, all processes had ended within 7 s."
 )
-"""What was found about a process that Ray left."""
+"""Line of the page on processes that Ray left."""
 
 
 def page(soak: Soak, kinds: list[Soaked]) -> str:
