@@ -138,4 +138,4 @@ def _write(part: Path, models: Models) -> None:
             text, encoding="ascii", newline="\n"
         )
 
-    draw_all(len(jobs), write, "the synthetic CAD models")
+    draw_all(len(jobs), write, "the synthetic CAD models", in_processes=True)
