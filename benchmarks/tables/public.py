@@ -174,10 +174,9 @@ def page() -> None:
         )
     lines += [
         "",
-        "For classes, the recommended start fits a temperature to training rows that its models left out. If the "
-        "classes of these rows are perfectly separable, as may happen with a small table, the temperature stops "
-        "at its lower bound, and the log says so. The predicted probabilities are then nearly 0 and 1, and a "
-        "wrong prediction would cost many nats.",
+        "For classes, the recommended start fits a temperature to training rows that its models left out. The "
+        "measured temperatures are those of highest likelihood (`uncertainty.temperature.prior=null`). By default, a "
+        "prior keeps the temperature near 1 where the classes of few rows are perfectly separable.",
     ]
     command = "Command: the two lines at the top of `benchmarks/tables/public.py`."
     publish(__file__, "\n".join([*lines, "", f"{machine('torch', 'scikit-learn')} {command}", ""]))

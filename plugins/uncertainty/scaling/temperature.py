@@ -27,15 +27,20 @@ _log = logging.getLogger(__name__)
 
 
 class Temperature(Uncertainty):
-    """Temperature scaling of densities p to p^(1/T), normalised, with the T of highest validation likelihood.
+    """Temperature scaling of densities p to p^(1/T), normalised, with the T of highest posterior density.
 
     For classes this divides logits by T (thesis eq. 2.19 with β = 0). The modes stay the same. Before `calibrate` T is
     1, which does not change the densities of the wrapped model. The fitted T is never worse than 1 on the validation
-    split. T stays within its bounds for any targets: on a perfectly separable split, where the likelihood rises without
-    end, T stops at the bound, and the log says so.
+    split. T stays within its bounds for any targets.
+
+    log T has a normal prior density around 0. On a perfectly separable split, the likelihood rises without end as T
+    decreases, but by little: a model that is right about all of few samples has hardly lost anything at T = 1. The
+    prior then keeps T near 1; many samples, or wrong predictions, outweigh it. Without the prior, T stops at the bound
+    on such a split, and the log says so.
 
     Args:
         lower, upper: bounds of T.
+        prior: standard deviation of the prior density of log T; None: no prior, so that T has the highest likelihood.
 
     Attributes:
         temperature: T, a float64 buffer.
@@ -54,11 +59,13 @@ class Temperature(Uncertainty):
         *,
         lower: Annotated[float, Field(gt=0, le=1)] = 0.05,
         upper: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 20.0,
+        prior: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = 1.0,
     ) -> None:
         super().__init__()
         self.model = model()
         self.lower = lower
         self.upper = upper
+        self.prior = prior
         self.register_buffer("temperature", torch.ones((), dtype=torch.float64))
         require_state(self, temperature=(lower, upper))
 
@@ -70,14 +77,25 @@ class Temperature(Uncertainty):
         """Calibrate the wrapped model, then fit the temperature."""
         kept_batches = nonempty_batches(batches, by="temperature")
         self.model.calibrate(kept_batches)
-        fitted = fit(predict_densities(self.model, kept_batches), kept_batches, self.lower, self.upper)
+        predicted = predict_densities(self.model, kept_batches)
+        fitted = fit(predicted, kept_batches, self.lower, self.upper, self.prior)
         self.temperature.fill_(fitted)
         rows = sum(len(batch["target"]) for batch in kept_batches)
-        self.remark = f"temperature: T = {fitted:.3g}, the most likely value for {rows} validation samples."
+        value = "most likely" if self.prior is None else "most probable"
+        self.remark = f"temperature: T = {fitted:.3g}, the {value} value for {rows} validation samples."
 
 
-def fit(predicted: Sequence[Distribution], batches: Sequence[Batch], lower: float, upper: float) -> float:
-    """Return the temperature T in [lower, upper] with the smallest mean negative log-likelihood.
+def fit(
+    predicted: Sequence[Distribution],
+    batches: Sequence[Batch],
+    lower: float,
+    upper: float,
+    prior: float | None = None,
+) -> float:
+    """Return the temperature T in [lower, upper] with the highest posterior density of log T.
+
+    This T minimises the negative log-likelihood plus (log T / prior)² / 2, the negative logarithm of the normal prior
+    density without its constant (maximum a posteriori; Bishop 2006, Pattern Recognition and Machine Learning, §1.2.5).
 
     If no temperature is better than 1, the result is 1. The negative log-likelihood of a target y is -log p(y)^(1/T) +
     log Z with the normalising constant Z of p^(1/T) (thesis eq. 2.19). Targets of probability 0 have probability 0 at
@@ -88,6 +106,7 @@ def fit(predicted: Sequence[Distribution], batches: Sequence[Batch], lower: floa
         batches: batches, whose targets are read.
         lower: lower bound of T.
         upper: upper bound of T.
+        prior: standard deviation of the prior density of log T; None for the T of highest likelihood.
     """
     targets = [batch["target"] for batch in batches]
     with torch.no_grad():
@@ -112,9 +131,15 @@ def fit(predicted: Sequence[Distribution], batches: Sequence[Batch], lower: floa
     low, high = (torch.tensor([bound], dtype=torch.float64).log() for bound in (lower, upper))
     candidates = [
         torch.zeros(1, dtype=torch.float64),
-        *torch.linspace(low.item(), high.item(), GRID).split(1),
+        *torch.linspace(low.item(), high.item(), GRID, dtype=torch.float64).split(1),
     ]
     values = torch.stack([total(terms, candidate) for candidate in candidates])
+    weight = 0.0 if prior is None else 1 / (2 * prior**2 * possible)
+    penalised = values + torch.stack([weight * candidate.square().sum() for candidate in candidates]).to(
+        values
+    )
+    if prior is not None:
+        terms.append(lambda point: (weight * point.square().sum()).to(values))
     least = rounding * (1 + values[0].abs())
     if not (values - values[0]).abs().max() > 4 * least:
         _log.warning(
@@ -122,7 +147,7 @@ def fit(predicted: Sequence[Distribution], batches: Sequence[Batch], lower: floa
             "the temperature stays 1."
         )
         return 1.0
-    start = candidates[int(values.nan_to_num(nan=math.inf).argmin())]
+    start = candidates[int(penalised.nan_to_num(nan=math.inf).argmin())]
     best = minimise(terms, start, low, high, rounding=rounding)
     if values[0] - best.value <= least:
         return 1.0

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-from scipy import optimize, special
+from scipy import optimize, special, stats
 from torch import nn
 from torch.distributions import Categorical, Independent, Normal
 
@@ -83,14 +83,21 @@ def cross_entropy(logits, label, logarithm):
     return -special.log_softmax(logits / math.exp(logarithm), -1)[np.arange(len(label)), label].mean()
 
 
+@pytest.mark.parametrize("prior", [None, 1.0, 0.03])
 @pytest.mark.parametrize("scale", [0.2, 1.0, 6.0])
-def test_the_temperature_agrees_with_scipy(scale):
+def test_the_temperature_agrees_with_scipy(scale, prior):
     for dtype, digits in ((torch.float64, 1e-7), (torch.float32, 2e-3)):
         logits, label = labelled(400, scale, dtype=dtype)
-        wrapper = around(PredictorOf(classes)).eval()
+        wrapper = around(PredictorOf(classes), prior=prior).eval()
         wrapper.calibrate(once(logits, label))
+        likelihood = functools.partial(cross_entropy, logits.double().numpy(), label.numpy())
 
-        nll = functools.partial(cross_entropy, logits.double().numpy(), label.numpy())
+        count = len(label)
+
+        def nll(logarithm, likelihood=likelihood, count=count):
+            penalty = 0 if prior is None else -stats.norm.logpdf(logarithm, scale=prior) / count
+            return likelihood(logarithm) + penalty
+
         wanted = optimize.minimize_scalar(
             nll, bounds=(math.log(0.05), math.log(20)), method="bounded", options={"xatol": 1e-12}
         )
@@ -105,7 +112,7 @@ def test_of_normals_it_is_the_ratio_of_variances(spread, wanted):
     inputs = torch.randn(2000, 2, generator=generator, dtype=torch.float64)
     noise = spread * torch.randn(2000, 1, generator=generator, dtype=torch.float64)
     target = inputs[:, :1] + inputs[:, 1:].exp() * noise
-    wrapper = around(PredictorOf(reals), REAL).eval()
+    wrapper = around(PredictorOf(reals), REAL, prior=None).eval()
     wrapper.calibrate(once(inputs, target, 64))
     exact = ((target - inputs[:, :1]) / inputs[:, 1:].exp()).square().mean().item()
     assert wrapper.temperature.item() == pytest.approx(exact, rel=1e-6)
@@ -149,7 +156,7 @@ def test_never_worse_than_before_even_with_several_maxima():
             weights = torch.tensor([0.0, -2.0, -6.0]).expand(len(inputs), 3)
             return Mixture(weights, Independent(base, 1, validate_args=False))
 
-        wrapper = around(PredictorOf(mixture), REAL).eval()
+        wrapper = around(PredictorOf(mixture), REAL, prior=None).eval()
         before = wrapper(inputs).log_prob(target).double().mean()
         wrapper.calibrate(once(inputs, target))
         after = wrapper(inputs).log_prob(target).double().mean()
@@ -169,7 +176,7 @@ def test_a_separable_set_stops_at_the_bound_and_says_so(caplog):
         (logits[:1].expand(5, 3), torch.zeros(5, dtype=torch.int64)),
     ):
         caplog.clear()
-        wrapper = around(PredictorOf(classes), lower=0.1).eval()
+        wrapper = around(PredictorOf(classes), lower=0.1, prior=None).eval()
         wrapper.calibrate(once(inputs, label))
         assert wrapper.temperature.item() == pytest.approx(0.1)
         assert "stopped at its lower bound 0.1" in caplog.text and "perfectly separable" in caplog.text
@@ -178,6 +185,18 @@ def test_a_separable_set_stops_at_the_bound_and_says_so(caplog):
     wrapper = around(PredictorOf(classes)).eval()
     wrapper.calibrate(once(1e4 * logits, (torch.arange(3) + 1) % 3))  # sure, and always wrong
     assert wrapper.temperature.item() == pytest.approx(20) and "upper bound 20" in caplog.text
+
+
+@pytest.mark.parametrize("count", [3, 30, 300])
+def test_a_model_that_is_right_about_few_samples_stays_near_one(caplog, count):
+    """Compare with the bound from the prior: (log T)² / 2 is at most the negative log-likelihood at T = 1."""
+    logits = torch.tensor([[5.0, 0.0, 0.0], [0.0, 6.0, 0.0], [0.0, 0.0, 9.0]], dtype=torch.float64)
+    label = torch.arange(count) % 3
+    wrapper = around(PredictorOf(classes)).eval()
+    lost = -torch.distributions.Categorical(logits=logits[label]).log_prob(label).sum().item()
+    wrapper.calibrate(once(logits[label], label))
+    assert math.exp(-math.sqrt(2 * lost)) < wrapper.temperature < 1
+    assert not caplog.text
 
 
 def test_uniform_densities_leave_it_at_one_and_it_is_said(caplog):
@@ -229,11 +248,12 @@ def test_what_is_wrapped_is_calibrated_first_and_left_as_it_was():
     assert model.calibrated == 3 and wrapper.training and model.training
     assert model.weight.grad is None
     wrapper.eval()
-    twice = around(
-        around(PredictorOf(classes))
-    ).eval()  # a temperature of a temperature has nothing left to do
-    twice.calibrate(once(logits, label))
-    assert twice.model.temperature.item() == pytest.approx(wrapper.temperature.item())
+    # a temperature of a temperature of highest likelihood has nothing left to do
+    twice = around(around(PredictorOf(classes), prior=None)).eval()
+    alone = around(PredictorOf(classes), prior=None).eval()
+    for either in (twice, alone):
+        either.calibrate(once(logits, label))
+    assert twice.model.temperature.item() == pytest.approx(alone.temperature.item())
     assert twice.temperature.item() == pytest.approx(1, abs=1e-6)
 
 
@@ -265,7 +285,9 @@ def test_never_outside_its_bounds_and_never_worse(logits, label, lower, upper):
     assert after.isfinite() and after >= before - 1e-12 * before.abs()
 
 
-@pytest.mark.parametrize("config", [{"lower": 0.0}, {"lower": 2.0}, {"upper": 0.5}, {"upper": math.inf}])
+@pytest.mark.parametrize(
+    "config", [{"lower": 0.0}, {"lower": 2.0}, {"upper": 0.5}, {"upper": math.inf}, {"prior": 0.0}]
+)
 def test_a_config_out_of_range_is_refused(config):
     with pytest.raises(ConfigError, match="uncertainty"):
         around(PredictorOf(classes), **config)
