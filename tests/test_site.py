@@ -86,6 +86,14 @@ def test_every_setting_of_every_plugin_has_a_meaning_on_its_page(site: ModuleTyp
     assert not [key for key, values, *_ in rows if values.startswith(("<", "typing."))]
 
 
+def test_the_training_loop_of_the_page_about_python_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    text = (ROOT / "docs/how_to/python.md").read_text(encoding="utf-8").partition("\n## Parts in your own")[2]
+    names: dict[str, object] = {}
+    for block in re.findall(r"(?ms)^```python\n(.*?)^```$", text):
+        exec(block, names)
+    assert capsys.readouterr().out.endswith("torch.Size([4, 512])\n")
+
+
 def known_settings(site: ModuleType) -> set[str]:
     """Return all settings with a dot in their names, of the framework, its plugins and the engines of sweeps."""
     pages, tables = sys.modules["method_pages"], sys.modules["setting_tables"]
