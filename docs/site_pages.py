@@ -33,8 +33,8 @@ BOOSTS = {
     **dict.fromkeys(("methods/", "reference/"), 1.0),
 }
 """Weights of pages in the results of a search, by the beginning of their paths; other pages have the weight 3."""
-WIDE = re.compile(r"(?m)^\|(?:[ :-]+\|){8,}$")
-"""Line below the heading of a table with at least eight columns."""
+WIDE = re.compile(r"(?m)^\|(?:[ :-]+\|){7,}$")
+"""Line below the heading of a table with at least seven columns."""
 
 
 @cache
@@ -149,7 +149,11 @@ def on_config(config: "MkDocsConfig") -> "MkDocsConfig":
             if source.startswith(f"{root}/") and source != f"{root}/README.md":
                 folders.setdefault(posixpath.dirname(source), []).append(source)
         below = [
-            {folder.partition("/")[2] or "general": [{Path(path).stem: path} for path in paths]}
+            {
+                folder.partition("/")[2].replace("chapter", "Chapter ") or "All chapters": [
+                    {Path(path).stem.replace("_", " "): path} for path in paths
+                ]
+            }
             for folder, paths in sorted(folders.items())
         ]
         sections["Evidence"].append({root.capitalize(): [f"{root}/README.md", *below]})

@@ -298,7 +298,7 @@ def main() -> None:
 def introduction(space: Space) -> Sequence[str]:
     """Return the first lines of the page."""
     return [
-        "# Search for a Pareto front, compared with grids",
+        f"# Search over {len(space.sweeps)} settings for a Pareto front, compared with grids",
         "",
         "This page shows whether a search over error and run time with NSGA-II (`hydra/sweeper=optuna "
         "hydra.sweeper.sampler=nsga2`) finds a Pareto front that no grid of the same number of trials dominates. "
