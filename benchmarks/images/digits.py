@@ -56,6 +56,7 @@ def train(root: Path) -> None:
     if not (SWEEPS / "digits_classes" / "results.json").exists():
         _run(
             "experiment=images/classification",
+            "uncertainty.temperature.prior=null",
             f"data.root={root}",
             *IMAGES,
             f"hydra.run.dir={_folder('classes')}",
@@ -320,7 +321,9 @@ density within 45° of the true angle, and within 45° of the opposite angle (th
 
 ## Classes
 
-`experiment=images/classification` (one seed) classifies {classes["test_samples"]} test images:
+`experiment=images/classification uncertainty.temperature.prior=null` (one seed) classifies {
+            classes["test_samples"]
+        } test images:
 
 | accuracy, % | negative log-likelihood, nats | expected calibration error | ms / image | minutes |
 |---:|---:|---:|---:|---:|

@@ -27,16 +27,16 @@ _log = logging.getLogger(__name__)
 
 
 class Temperature(Uncertainty):
-    """Temperature scaling of densities p to p^(1/T), normalised, with the T of highest posterior density.
+    """Temperature scaling of densities p to p^(1/T), normalised, with the T of highest validation likelihood.
 
     For classes this divides logits by T (thesis eq. 2.19 with β = 0). The modes stay the same. Before `calibrate` T is
     1, which does not change the densities of the wrapped model. The fitted T is never worse than 1 on the validation
-    split. T stays within its bounds for any targets.
+    split. T stays within its bounds for any targets: on a perfectly separable split, where the likelihood rises without
+    end as T decreases, T stops at the bound, and the log says so.
 
-    log T has a normal prior density around 0. On a perfectly separable split, the likelihood rises without end as T
-    decreases, but by little: a model that is right about all of few samples has hardly lost anything at T = 1. The
-    prior then keeps T near 1; many samples, or wrong predictions, outweigh it. Without the prior, T stops at the bound
-    on such a split, and the log says so.
+    With `prior`, log T has a normal prior density around 0, and T has the highest posterior density. On a separable
+    split of few samples, the likelihood rises by little as T decreases, because the model has hardly lost anything at
+    T = 1. The prior then keeps T near 1; many samples, or wrong predictions, outweigh it.
 
     Args:
         lower, upper: bounds of T.
@@ -59,7 +59,7 @@ class Temperature(Uncertainty):
         *,
         lower: Annotated[float, Field(gt=0, le=1)] = 0.05,
         upper: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 20.0,
-        prior: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = 1.0,
+        prior: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None,
     ) -> None:
         super().__init__()
         self.model = model()
@@ -153,10 +153,14 @@ def fit(
         return 1.0
     if best.active.item():
         _log.warning(
-            "temperature: T stopped at its %s bound %g, where the likelihood of the validation split still rises: %s.",
-            *("upper", upper, "the wrapped model carries no information about the targets")
+            "temperature: T stopped at its %s bound %g, where the likelihood of the validation split still rises: %s",
+            *("upper", upper, "the wrapped model carries no information about the targets.")
             if best.active.item() > 0
-            else ("lower", lower, "the split is perfectly separable, or too small"),
+            else (
+                "lower",
+                lower,
+                "the split is perfectly separable, or too small. uncertainty.temperature.prior=1.0 keeps T near 1.",
+            ),
         )
     return min(max(best.point.exp().item(), lower), upper)
 

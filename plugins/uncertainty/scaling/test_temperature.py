@@ -112,7 +112,7 @@ def test_of_normals_it_is_the_ratio_of_variances(spread, wanted):
     inputs = torch.randn(2000, 2, generator=generator, dtype=torch.float64)
     noise = spread * torch.randn(2000, 1, generator=generator, dtype=torch.float64)
     target = inputs[:, :1] + inputs[:, 1:].exp() * noise
-    wrapper = around(PredictorOf(reals), REAL, prior=None).eval()
+    wrapper = around(PredictorOf(reals), REAL).eval()
     wrapper.calibrate(once(inputs, target, 64))
     exact = ((target - inputs[:, :1]) / inputs[:, 1:].exp()).square().mean().item()
     assert wrapper.temperature.item() == pytest.approx(exact, rel=1e-6)
@@ -156,7 +156,7 @@ def test_never_worse_than_before_even_with_several_maxima():
             weights = torch.tensor([0.0, -2.0, -6.0]).expand(len(inputs), 3)
             return Mixture(weights, Independent(base, 1, validate_args=False))
 
-        wrapper = around(PredictorOf(mixture), REAL, prior=None).eval()
+        wrapper = around(PredictorOf(mixture), REAL).eval()
         before = wrapper(inputs).log_prob(target).double().mean()
         wrapper.calibrate(once(inputs, target))
         after = wrapper(inputs).log_prob(target).double().mean()
@@ -176,7 +176,7 @@ def test_a_separable_set_stops_at_the_bound_and_says_so(caplog):
         (logits[:1].expand(5, 3), torch.zeros(5, dtype=torch.int64)),
     ):
         caplog.clear()
-        wrapper = around(PredictorOf(classes), lower=0.1, prior=None).eval()
+        wrapper = around(PredictorOf(classes), lower=0.1).eval()
         wrapper.calibrate(once(inputs, label))
         assert wrapper.temperature.item() == pytest.approx(0.1)
         assert "stopped at its lower bound 0.1" in caplog.text and "perfectly separable" in caplog.text
@@ -188,11 +188,11 @@ def test_a_separable_set_stops_at_the_bound_and_says_so(caplog):
 
 
 @pytest.mark.parametrize("count", [3, 30, 300])
-def test_a_model_that_is_right_about_few_samples_stays_near_one(caplog, count):
+def test_with_a_prior_a_model_that_is_right_about_few_samples_stays_near_one(caplog, count):
     """Compare with the bound from the prior: (log T)² / 2 is at most the negative log-likelihood at T = 1."""
     logits = torch.tensor([[5.0, 0.0, 0.0], [0.0, 6.0, 0.0], [0.0, 0.0, 9.0]], dtype=torch.float64)
     label = torch.arange(count) % 3
-    wrapper = around(PredictorOf(classes)).eval()
+    wrapper = around(PredictorOf(classes), prior=1.0).eval()
     lost = -torch.distributions.Categorical(logits=logits[label]).log_prob(label).sum().item()
     wrapper.calibrate(once(logits[label], label))
     assert math.exp(-math.sqrt(2 * lost)) < wrapper.temperature < 1
@@ -248,12 +248,11 @@ def test_what_is_wrapped_is_calibrated_first_and_left_as_it_was():
     assert model.calibrated == 3 and wrapper.training and model.training
     assert model.weight.grad is None
     wrapper.eval()
-    # a temperature of a temperature of highest likelihood has nothing left to do
-    twice = around(around(PredictorOf(classes), prior=None)).eval()
-    alone = around(PredictorOf(classes), prior=None).eval()
-    for either in (twice, alone):
-        either.calibrate(once(logits, label))
-    assert twice.model.temperature.item() == pytest.approx(alone.temperature.item())
+    twice = around(
+        around(PredictorOf(classes))
+    ).eval()  # a temperature of a temperature has nothing left to do
+    twice.calibrate(once(logits, label))
+    assert twice.model.temperature.item() == pytest.approx(wrapper.temperature.item())
     assert twice.temperature.item() == pytest.approx(1, abs=1e-6)
 
 
