@@ -1,5 +1,4 @@
-"""head -1`).|Commands whose output is no longer read (`| head -1`), which continue and end without an error
-message.| head -1`)."""
+"""Commands whose output is no longer read (`| head -1`): they continue and end without an error message."""
 
 import io
 import os
@@ -18,6 +17,7 @@ from framework.storage.commands import run_command
 ROOT = Path(__file__).parents[1]
 OF_OUR_OWN = {
     "framework/sweeps/fork_server.py",
+    "framework/sweeps/ray_guard.py",
     "framework/sweeps/rehearsal.py",
     "framework/tracking/store_process.py",
     "framework/tracking/watch.py",
