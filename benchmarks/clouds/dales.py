@@ -115,7 +115,8 @@ def row(
 
 def draw(rows: Sequence[Mapping[str, Any]], title: str, path: Path, *, synthetic: bool) -> None:
     """Draw the accuracy of each method against its operations and its run time, into a file beside `path`."""
-    figure = titled_figure((8.4, 4.2), title, synthetic=synthetic)
+    lines_of_legend = math.ceil(len(rows) / 3)
+    figure = titled_figure((8.4, 3.8 + 0.2 * lines_of_legend), title, synthetic=synthetic)
     panels = figure.subplots(1, 2, sharey=True)
     labels = {"mflop": "MFLOP per cloud (matrix products)", "milliseconds": "ms per cloud (one thread)"}
     for axes, (key, label) in zip(panels, labels.items(), strict=True):
@@ -124,8 +125,8 @@ def draw(rows: Sequence[Mapping[str, Any]], title: str, path: Path, *, synthetic
                 result[key],
                 result["accuracy"],
                 yerr=result["accuracy_sem"],
-                marker=MARKERS[number],
-                color=COLOURS[number],
+                marker=MARKERS[number % len(MARKERS)],
+                color=COLOURS[number % len(COLOURS)],
                 capsize=3,
                 linestyle="none",
                 label=result["method"],
@@ -133,7 +134,8 @@ def draw(rows: Sequence[Mapping[str, Any]], title: str, path: Path, *, synthetic
         axes.set_xscale("log")
         ticks = [digit * 10.0**power for power in range(-3, 6) for digit in (1, 2, 5)]
         low, high = (choose(result[key] for result in rows) for choose in (min, max))
-        axes.set_xticks([tick for tick in ticks if low / 2 <= tick <= high * 2])
+        axes.set_xlim(low / 1.6, high * 1.6)
+        axes.set_xticks([tick for tick in ticks if low / 1.5 <= tick <= high * 1.5])
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter("")
         axes.set_xlabel(label)
