@@ -18,6 +18,8 @@ from framework.storage import limits
 from framework.storage.enclosed import require_inside_data
 
 RESTORE = "Copy the file again from its source."
+AT_ONCE = 2**16
+"""Largest number of bytes that `Bounded.read` requests without comparing it with the size of the file."""
 SMALL, MOST_TIMES = limits.UNFOLDED_BYTES, limits.UNFOLDED_TIMES
 
 
@@ -115,6 +117,8 @@ class Bounded(io.BufferedReader):
     def read(self, size: int | None = -1, /) -> bytes:
         if size is None or size < 0:
             return super().read()
+        if size <= AT_ONCE:  # Pillow reads a JPEG file without markers byte by byte
+            return super().read(size)
         return super().read(min(size, max(0, os.fstat(self.fileno()).st_size - self.tell())))
 
 
