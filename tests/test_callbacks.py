@@ -2,7 +2,9 @@
 
 import math
 import signal
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import pytorch_lightning as pl
@@ -17,6 +19,7 @@ from framework.configuration.settings import (
     WeightAveragingSettings,
 )
 from framework.errors import ConfigError
+from framework.storage import checkpoints
 from framework.training.callbacks import AccumulateGradients, AverageWeights
 from tests.conftest import TINY, Framework
 
@@ -193,3 +196,37 @@ def test_contradictions_are_refused(framework: Framework, settings: list[str], s
 
 def test_no_callback_is_chosen_by_default() -> None:
     assert Settings().callbacks == CallbackSettings()
+
+
+DAMAGES: dict[str, Callable[[dict[str, Any]], object]] = {
+    "optimiser": lambda state: state["optimizer_states"][0]["state"][0].update(exp_avg=None),
+    "groups": lambda state: state["optimizer_states"][0].update(param_groups=math.nan),
+    "loops": lambda state: state["loops"]["fit_loop"].update({"epoch_loop.batch_progress": [[1]]}),
+    "schedule": lambda state: state.update(lr_schedulers=[math.nan]),
+    "average": lambda state: state.update(current_model_state=1e308),
+    "callbacks": lambda state: state.update(callbacks={key: [1] for key in state["callbacks"]}),
+    "counter": lambda state: state["loops"]["fit_loop"]["epoch_loop.state_dict"].update(
+        _batches_that_stepped=None
+    ),
+    "step": lambda state: state.update(global_step="x"),
+}
+
+
+@pytest.mark.parametrize(
+    "damage", [pytest.param(name, marks=() if name == "loops" else pytest.mark.slow) for name in DAMAGES]
+)
+def test_a_foreign_state_of_a_training_gets_a_sentence(
+    framework: Framework, tmp_path: Path, damage: str
+) -> None:
+    killed = framework(
+        *QUIET, *CASES["averaged"], "trainer.checkpoint_every_steps=2", "+data.signal_at=14",
+        f"+data.signal_number={int(signal.SIGKILL)}", f"+data.signal_marker={tmp_path / 'marker'}", folder="killed",
+    )  # fmt: skip
+    folder = killed.folder / "checkpoints"
+    state = checkpoints.read(folder / "last.ckpt")
+    DAMAGES[damage](state)
+    for name in ("last.ckpt", "previous.ckpt"):
+        checkpoints.write(state, folder / name)
+    resumed = framework(f"resume={killed.folder}")
+    assert resumed.code == 1 and "Traceback" not in resumed.out, resumed.out
+    assert "previous.ckpt: " in resumed.out and "Start a new run if the checkpoint is damaged" in resumed.out

@@ -20,7 +20,7 @@ from framework.encoder import FitsInputs
 from framework.errors import ConfigError
 from framework.model import FrozenFrontEnd, fitted_models, learns
 from framework.runs.job import PRUNED, RECORD
-from framework.runs.resuming import begin_again, resume_arguments
+from framework.runs.resuming import begin_again, blame_checkpoint, resume_arguments
 from framework.runs.run import PROFILE, RANGE_TEST, Run
 from framework.runs.session import Session, trained_batches
 from framework.storage.checkpoints import read
@@ -191,7 +191,7 @@ def _fit_by_gradient(session: Session, run: Run) -> Fitted:
     batches.orders = several.model_count if several else 1
     loaded = LoadedBatches(batches, trainer)
     resume = begin_again(run, session.console, trainer.world_size, batches.orders)
-    with end_together(trainer, run.stopper, partial(_give_up, run)):
+    with blame_checkpoint(resume, training), end_together(trainer, run.stopper, partial(_give_up, run)):
         trainer.fit(training, datamodule=loaded, ckpt_path=resume, weights_only=True)
         _leave_process_group()
     early = any(isinstance(callback, StopEarly) and callback.stopped for callback in trainer.callbacks)  # type: ignore[attr-defined]

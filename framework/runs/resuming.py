@@ -14,18 +14,20 @@ needs. Other modules read `Run.resumed` to find out whether a run continues.
 
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from framework.configuration.config import Config
 from framework.configuration.paths import flatten, paths_of, require_repeated, shell_arguments
 from framework.configuration.settings import Settings
-from framework.errors import ConfigError
+from framework.errors import CheckpointError, ConfigError, UserError, shorten
 from framework.runs import provenance
 from framework.storage.first_rank import first_rank
 from framework.storage.old_versions import can_resume_from_best
 from framework.storage.plain_values import read_yaml
+from framework.storage.reading import translate_errors
 from framework.tracking.ended import sync
 from framework.tracking.run_info import read_run_info
 from framework.tracking.stores import confirm_address
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from framework.runs.run import Run
+    from framework.training.module import Training
 
 HOW = ("threads", "workers", "logger.uri")
 """Keys that do not affect the result of a run, except that `threads` may change the last digits.
@@ -49,6 +52,8 @@ CHANGEABLE = (*HOW, *PROCESSES)
 """Keys whose values may change when a run is resumed."""
 TRAINED = ("last.ckpt", "previous.ckpt")
 """Names of checkpoints from which training can resume; all others hold weights only."""
+DAMAGED = "Start a new run if the checkpoint is damaged; otherwise see traceback.txt in the run folder."
+"""Advice if a training cannot continue."""
 BEST = "best.ckpt"
 """Name of the checkpoint with the lowest validation loss."""
 
@@ -171,6 +176,33 @@ def find_resumable(folder: Path) -> Path | None:
     return best if best is not None and can_resume_from_best(checkpoints.read(best)) else None
 
 
+@contextmanager
+def blame_checkpoint(checkpoint: Path | None, training: "Training") -> Iterator[None]:
+    """Convert errors in the first epoch of a resumed training to an error that names the checkpoint.
+
+    The state of optimisers, loops and callbacks may come from an untrusted source, and Lightning does not check it.
+
+    Args:
+        checkpoint: Checkpoint from which the training continues; None for a training that begins anew.
+        training: The training.
+
+    Raises:
+        CheckpointError: The training cannot continue from the checkpoint.
+    """
+    import torch  # a command that is refused does not need it
+
+    try:
+        yield
+    except Exception as error:
+        own = isinstance(error, UserError | OSError | MemoryError | torch.OutOfMemoryError)
+        if checkpoint is None or training.begun_epochs > 1 or own:
+            raise
+        raise CheckpointError(
+            f"{checkpoint}: The training cannot continue from this checkpoint ({type(error).__name__}: "
+            f"{shorten(error)}). {DAMAGED}"
+        ) from error
+
+
 def begin_again(run: "Run", console: "Console", processes: int, models: int) -> Path | None:
     """Return the checkpoint from which the training of `run` continues, or None if it begins anew.
 
@@ -197,7 +229,8 @@ def begin_again(run: "Run", console: "Console", processes: int, models: int) -> 
         console.print("nothing to resume from yet: starting from the beginning.")
         return None
     stored = checkpoints.read(checkpoint)
-    step, before = int(stored["global_step"]), stored.get("processes")
+    with translate_errors(checkpoint, "the state of a training", DAMAGED, kind=CheckpointError):
+        step, before = int(stored["global_step"]), stored.get("processes")
     before = before if isinstance(before, int) else processes  # an earlier version did not store the number
     if models > 1 and (before == 1) != (processes == 1):
         raise ConfigError(

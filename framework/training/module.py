@@ -85,6 +85,9 @@ class Training(pl.LightningModule):
         description: description of the model, which is added to checkpoints (`configuration.description`).
         cached: True if batches hold cached features (training.cached_features) instead of inputs; the predictor is then
             a `FrozenFrontEnd`.
+
+    Attributes:
+        begun_epochs: number of epochs that have begun since the training began or was resumed.
     """
 
     def __init__(
@@ -106,6 +109,11 @@ class Training(pl.LightningModule):
         self.seed = seed
         self.description = description
         self.cached = cached
+        self.begun_epochs = 0
+
+    def on_train_epoch_start(self) -> None:
+        """Count the epochs."""
+        self.begun_epochs += 1
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Set an attribute, without torch's slow checks if it is the name of the hook that Lightning is running.
