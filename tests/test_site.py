@@ -9,9 +9,11 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from html.parser import HTMLParser
 from pathlib import Path
 from types import ModuleType
+from urllib.parse import unquote, urlsplit
 
 import pytest
 import yaml
@@ -28,6 +30,40 @@ FOREIGN = re.compile(
     r"|@import[^;]*//[^;]*;|url\([\"']?(?:https?:)?//[^)]*\)"
 )
 """Pattern of the elements that a browser would load from another server."""
+
+
+class Links(HTMLParser):
+    """Parser of a page: its anchors, the links and images that it shows, and its images without a description."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.anchors: set[str] = set()
+        self.links: list[str] = []
+        self.bare: list[str] = []
+        self.feed(page.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = {key: value or "" for key, value in attrs}
+        self.anchors |= {values[key] for key in ("id", "name") if key in values}
+        self.links += [values[key] for key in ("href", "src") if tag in ("a", "img") and values.get(key)]
+        self.bare += [values.get("src", "")] if tag == "img" and not values.get("alt") else []
+
+
+def dead_links(folder: Path) -> Iterator[str]:
+    """Yield the links of a built site that lead to no file or to no anchor, and the images without a description."""
+    pages = {path.resolve(): Links(path) for path in folder.rglob("*.html") if path.name != "404.html"}
+    for path, page in pages.items():
+        for link in page.links:
+            parts = urlsplit(link)
+            target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            if parts.scheme or parts.netloc:
+                continue
+            anchors = pages[target].anchors if target in pages else {unquote(parts.fragment)}
+            if not target.exists() or (parts.fragment and unquote(parts.fragment) not in anchors):
+                yield f"{path.relative_to(folder.resolve())}: {link}"
+        yield from (
+            f"{path.relative_to(folder.resolve())}: {source} has no description" for source in page.bare
+        )
 
 
 @pytest.fixture(scope="module")
@@ -163,6 +199,7 @@ def test_the_site_builds_without_warnings_and_loads_nothing_from_elsewhere(
         for match in FOREIGN.finditer(path.read_text(encoding="utf-8"))
     }
     assert not foreign
+    assert not list(dead_links(tmp_path / "site"))
     placeholders = re.compile(r"<(?:name|run|time|folder|file|id|key|group|registry|value)\b[^>]*>")
     lost = {
         (path.name, match[0])
