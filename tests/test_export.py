@@ -507,6 +507,8 @@ def test_predictions_do_not_depend_on_the_other_inputs_of_a_batch(
     wrapper = build("uncertainty", part, model=lambda: Model([network], head), target=target).eval()
     exporting.export(wrapper, describe((6,), target), tmp_path / "dropout")
     dropout = importlib.import_module("predict").load(tmp_path / "dropout")
+    with pytest.raises(ValueError, match="predicts classes, which have no central interval"):
+        list(dropout.table(generator.normal(size=(1, 6)), 0.9))
     numbers = generator.normal(size=(3, 6))
     alone = [dropout(row[None]).probabilities[0] for row in numbers]
     np.testing.assert_allclose(dropout(numbers).probabilities, alone, rtol=1e-5, atol=1e-6)
@@ -522,6 +524,19 @@ def test_predictions_do_not_depend_on_the_other_inputs_of_a_batch(
     ):
         with pytest.raises(ValueError, match=words):
             model(bad)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"1,2\n3,4\n", b"PK\x03\x04", b"\x93NUMPY", b"\x80\x04N."], ids=repr
+)
+def test_a_file_that_is_no_array_gets_a_sentence(content: bytes, tmp_path: Path) -> None:
+    script = importlib.import_module("framework.deployment.exported_folder.predict")
+    file = tmp_path / "rows.csv"
+    file.write_bytes(content)
+    with pytest.raises(
+        ValueError, match=r"rows.csv is not an array .* of the shape \(batch, 2\) with numpy.save"
+    ):
+        script.read_array(file, ["batch", 2])
 
 
 def test_the_exported_folder_needs_numpy_and_onnxruntime_alone(framework: Framework, tmp_path: Path) -> None:

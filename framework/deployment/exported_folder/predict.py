@@ -19,6 +19,7 @@ import math
 import os
 import re
 import sys
+import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -155,13 +156,22 @@ class Model:
 
         Args:
             inputs: inputs that a call of the model takes.
-            interval: probability of the interval; None leaves its ends out. Classes have none.
+            interval: probability of the interval; None leaves its ends out.
+
+        Raises:
+            ValueError: an interval is requested of classes or images, which have none.
         """
         density = self(inputs)
         target = self.description["target"]
         names: list[str] = target["names"]
         entropy = density.entropy()
-        ends = density.interval(interval) if interval is not None and len(density.event) == 1 else None
+        if interval is not None and len(density.event) != 1:
+            kind = "images" if density.event else "classes"
+            raise ValueError(
+                f"Got the interval {interval:g}, but the model predicts {kind}, which have no central interval. Leave "
+                "the interval out."
+            )
+        ends = None if interval is None else density.interval(interval)
         if not density.event:
             shares = density.probabilities
         point = density.mode() if not density.event else density.median()
@@ -200,6 +210,26 @@ def load(folder: str | Path = Path(__file__).parent, threads: int = 1) -> Model:
         threads: number of processor threads of a prediction.
     """
     return Model(folder, threads)
+
+
+def read_array(file: Path, shape: list[Any]) -> NDArray[Any]:
+    """Return the array in a .npy file; `shape` is the shape of the model's inputs, for the message.
+
+    Raises:
+        ValueError: the file is not a .npy file of numbers.
+    """
+    try:
+        with file.open("rb") as stream:
+            array = np.load(stream, allow_pickle=False)
+    except (ValueError, EOFError, zipfile.BadZipFile):
+        array = None
+    if not isinstance(array, np.ndarray):
+        sizes = ", ".join(map(str, shape))
+        raise ValueError(
+            f"{file} is not an array that numpy.save wrote. Save an array of the shape ({sizes}) with numpy.save. CSV "
+            "files are read only for a model of a table."
+        )
+    return array
 
 
 def read_csv(file: Path, columns: list[str]) -> NDArray[np.float64]:
@@ -299,10 +329,10 @@ def main(arguments: Mapping[str, Any] | None = None) -> None:
     model = load()
     try:
         columns = model.description["input"].get("columns") or []
-        if options.inputs.suffix == ".csv" and columns:
-            inputs: Any = read_csv(options.inputs, columns)
+        if options.inputs.suffix.lower() == ".csv" and columns:
+            inputs = read_csv(options.inputs, columns)
         else:
-            inputs = np.load(options.inputs, allow_pickle=False)
+            inputs = read_array(options.inputs, model.description["input"]["shape"])
         rows = list(model.table(inputs, options.interval))
     except (OSError, ValueError) as error:
         sys.exit(str(error))

@@ -124,6 +124,10 @@ def _read_json(content: bytes) -> tuple[Any, Any]:
         request = json.loads(content)
     except UnicodeDecodeError:
         raise ValueError("The body is not JSON in UTF-8.") from None
+    except json.JSONDecodeError as error:
+        raise ValueError(
+            f'The body is not JSON: {error}. Send {{"inputs": [...]}}, or a .npy file as application/octet-stream.'
+        ) from None
     if not isinstance(request, dict) or "inputs" not in request or set(request) - {"inputs", "interval"}:
         raise ValueError('Expected {"inputs": [...], "interval": 0.9}; interval may be left out.')
     if not isinstance(request["inputs"], list):
