@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -90,6 +91,73 @@ def test_the_test_file_of_a_new_plugin_passes_and_finds_a_fault(framework: Frame
     plugin = package / "my_metric" / "plugin.py"
     plugin.write_text(plugin.read_text().replace('_sem": error', '_sem": 2 * error'))
     assert "FAILED" in outcome().stdout
+
+
+MISTAKES: dict[str, tuple[str, str, str]] = {
+    "no call of the base class": (
+        "        super().__init__()\n",
+        "",
+        r"Write `super\(\).__init__\(\)` as its first line",
+    ),
+    "no size": ("        self.size =", "        self.sizes =", "leaves `size` at None"),
+    "a tensor": (
+        "return Laplace(location,",
+        "return torch.add(location,",
+        "returns an object of type Tensor",
+    ),
+    "a wrong name": (
+        "len(target.names)",
+        "len(target.labels)",
+        r"cannot be built: AttributeError: .* \(raised at \S+plugin.py:\d+\)",
+    ),
+    "an error of the module": (
+        "LARGEST = 1e18",
+        "LARGEST = 1 / 0",
+        r"ZeroDivisionError: .* \(at \S+plugin.py:\d+\)",
+    ),
+    "an error of forward": (
+        "-1)\n        return",
+        "-1)[7]\n        return",
+        r"IndexError: .* \(raised at \S+plugin.py:\d+\)",
+    ),
+    "no entropy": ("def entropy", "def entropies", "NotImplementedError: raised by `entropy` of Laplace"),
+    "a shape": (
+        "math.log(2)).sum(-1)",
+        "math.log(2))",
+        r"shape of the loss of a batch of shape \(\): \(2,\)|\(1,\), expected \(\)",
+    ),
+}
+"""Name of a beginner's mistake → text of a new density head, what replaces it, and words that `mode=check` prints."""
+
+
+def test_mode_check_leads_to_a_beginners_mistake(framework: Framework, tmp_path: Path) -> None:
+    assert framework("mode=new", "mode.plugin=density_head/my_head", folder=None).code == 0
+    package = tmp_path / "my_head"
+    install(package)
+    plugin = package / "my_head" / "plugin.py"
+    code = plugin.read_text(encoding="utf-8")
+    for name, (old, new, words) in MISTAKES.items():
+        assert old in code, name
+        plugin.write_text(code.replace(old, new, 1), encoding="utf-8")
+        done = framework("mode=check", "density_head=my_head", paths=(package,))
+        assert done.code in (1, 2), name
+        assert re.search(words, " ".join(done.out.split())), (name, done.out)
+        assert "Traceback" not in done.out, name
+
+
+def test_a_package_without_its_configs_affects_its_own_plugins_alone(
+    framework: Framework, tmp_path: Path
+) -> None:
+    assert framework("mode=new", "mode.plugin=metric/my_metric", folder=None).code == 0
+    package = tmp_path / "my_metric"
+    install(package)
+    shutil.rmtree(package / "my_metric" / "conf")
+    done = framework("experiment=cest/mlp", "--cfg", "job", folder=None, paths=(package,))
+    assert done.code == 0, done.out
+    done = framework("mode=check", "metric=[my_metric]", paths=(package,))
+    assert done.code == 2
+    assert "Write metric/my_metric.yaml with the line `name: my_metric`" in done.out
+    assert "`# @package metric.my_metric`" in done.out
 
 
 @pytest.mark.parametrize(

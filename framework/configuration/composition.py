@@ -21,11 +21,9 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from framework.configuration.registry import config_folders
+from framework.configuration.registry import SEVERAL, config_folders, describe_missing_config
 from framework.errors import ConfigError, did_you_mean, list_names, nearest_name, shorten
 
-PLURAL = ("encoder", "uncertainty", "objective", "metric")
-"""Groups from which an experiment may choose several plugins; the config maps a name to each of them."""
 GLOBAL = ("experiment", "preset", "debug")
 """Groups whose configs set keys at the top level."""
 
@@ -108,7 +106,7 @@ def _escape_quote(match: re.Match[str]) -> str:
 def plain(config: DictConfig) -> dict[str, Any]:
     """Return the composed config as plain values with interpolations resolved.
 
-    In the groups `PLURAL`, entries without a `name` are dropped. Such an entry remains, for example, if an experiment
+    In the groups `SEVERAL`, entries without a `name` are dropped. Such an entry remains, for example, if an experiment
     sets keys of `encoder.a`, and the command replaces this encoder by `encoder=b`.
 
     Raises:
@@ -128,7 +126,7 @@ def plain(config: DictConfig) -> dict[str, Any]:
                 f"_global_`, because Hydra puts its keys under `{group}` otherwise. Keys and values must follow this "
                 "line."
             )
-    for group in PLURAL:
+    for group in SEVERAL:
         chosen = values.get(group) or {}
         values[group] = {
             key: part for key, part in chosen.items() if isinstance(part, Mapping) and "name" in part
@@ -173,7 +171,7 @@ def _help_paragraph(group: str) -> str:
         lines += textwrap.wrap(
             ", ".join(names), width, initial_indent=start, subsequent_indent="    ", break_on_hyphens=False
         )
-    heading = f"{group}=[<name>,...]" if group in PLURAL else f"{group}=<name>"
+    heading = f"{group}=[<name>,...]" if group in SEVERAL else f"{group}=<name>"
     if group == "hydra":
         heading = "hydra/launcher=<name> and hydra/sweeper=<name>"
     return "\n".join(["", heading, *lines])
@@ -199,6 +197,9 @@ def describe_error(error: BaseException) -> str | None:
     if isinstance(error, MissingConfigException):
         config_name = error.missing_cfg_file or ""
         group, _, name = config_name.partition("/")
+        installed = describe_missing_config(group, name)
+        if installed:
+            return f"There is no config {config_name!r}.{installed}"
         known = [str(option) for option in error.options or ()] or options(group)
         available = f" Available in {group}: {list_names(name, known)}." if known else ""
         return f"There is no config {config_name!r}.{did_you_mean(name, known)}{available}"

@@ -7,11 +7,14 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
+from traceback import walk_tb
 from typing import Any
 
 from framework.errors import ConfigError, did_you_mean, list_names, quote
 
 GROUPS = ("data", "encoder", "density_head", "uncertainty", "objective", "renderer", "metric")
+SEVERAL = ("encoder", "uncertainty", "objective", "metric")
+"""Groups from which an experiment may choose several plugins; the config maps a name to each of them."""
 MODEL = ("encoder", "density_head", "uncertainty")
 """Groups of the plugins with which a model predicts."""
 
@@ -121,7 +124,8 @@ def load(group: str, name: str) -> type[Any]:
     except Exception as error:
         raise ConfigError(
             f"The {group} {name!r} ({entry.value}, of {origin(entry)}) cannot be imported: "
-            f"{type(error).__name__}: {error}. Repair or uninstall that package; other plugins still work."
+            f"{type(error).__name__}: {error}{_import_line(error)}. Repair or uninstall that package; other plugins "
+            "still work."
         ) from error
     if not (isinstance(cls, type) and group_of(cls) == group):
         raise ConfigError(
@@ -135,6 +139,16 @@ def load(group: str, name: str) -> type[Any]:
             f"framework calls. Implement what the docstrings of framework.{group} describe."
         )
     return cls
+
+
+def _import_line(error: Exception) -> str:
+    """Return " (at <file>:<line>)" of the line that failed; "" for a syntax error, whose message has it."""
+    lines = [
+        f" (at {frame.f_code.co_filename}:{line})"
+        for frame, line in walk_tb(error.__traceback__)
+        if frame.f_globals.get("__name__", "").partition(".")[0] in plugin_packages()
+    ]
+    return lines[-1] if lines and not isinstance(error, SyntaxError) else ""
 
 
 def _describe_missing_module(entry: Entry, module: str) -> str:
@@ -192,10 +206,33 @@ def config_folders() -> dict[str, Path]:
                 f"The plugin {entry.name!r} ({origin(entry)}) ships {own.relative_to(folder)}, but a plugin may not "
                 "configure Hydra itself, because Hydra's logging config can run code. Uninstall the plugin."
             )
-        if folder not in folders.values():
+        if folder not in folders.values() and folder.is_dir():  # a missing folder affects only its own plugin
             # two packages may give their folders the same name, and both are kept
             folders[f"{entry.name} of {origin(entry)}" if entry.name in folders else entry.name] = folder
     return folders
+
+
+def describe_missing_config(group: str, name: str) -> str:
+    """Return a sentence for an installed plugin without a config that chooses it; "" if no such plugin is installed."""
+    entry = installed(group).get(name) if group in GROUPS else None
+    if entry is None or entry.dist is None:
+        return ""
+    own = [
+        conf.value
+        for conf in _entry_points().select(group="framework.conf")
+        if conf.dist is not None and package_name(conf.dist) == package_name(entry.dist)
+    ]
+    where = (
+        f"in the package {own[0]}, which its entry point of the group framework.conf names"
+        if own
+        else "in a package that an entry point of the group framework.conf names, e.g. "
+        f'`{name} = "{entry.value.partition(".")[0]}.conf"`'
+    )
+    package = f" below the line `# @package {group}.{name}`" if group in SEVERAL else ""
+    return (
+        f" The {group} {name!r} ({entry.value}, of {origin(entry)}) is installed, but only a config can choose it. "
+        f"Write {group}/{name}.yaml with the line `name: {name}`{package} {where}. `mode=new` writes such a package."
+    )
 
 
 def package_folders(package: str) -> list[Path]:

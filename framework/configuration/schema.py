@@ -144,13 +144,19 @@ def build(group: str, config: Mapping[str, Any], **context: Any) -> Any:
                 f"{group} {config['name']} cannot be built, because its part `{key}` cannot be built: {error}"
             ) from error
     try:
-        return cls(*supplied, **arguments(cls, values))
+        plugin = cls(*supplied, **arguments(cls, values))
     except ValueError as error:
         parameters = " ".join(f"{key}={shorten(value)}" for key, value in config.items() if key != "name")
         raise ConfigError(
             f"{group} {config['name']} refuses {parameters or 'its arguments'}: {shorten(error)} (ValueError at "
             f"{_error_line(error, cls)})."
         ) from error
+    if hasattr(cls, "register_buffer") and "_modules" not in vars(plugin):  # a torch.nn.Module
+        raise ConfigError(
+            f"The constructor of {cls.__name__}, the {group} {config['name']!r}, does not call that of its base class. "
+            "Write `super().__init__()` as its first line."
+        )
+    return plugin
 
 
 def _error_line(error: BaseException, cls: type) -> str:

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
@@ -18,7 +18,7 @@ from framework.errors import ConfigError, UserError
 from framework.reports.table import write_csv
 from framework.storage.progress import PlainConsole
 from framework.testing.contract import CONTRACTS, Contract, Row, contract
-from framework.testing.finding import Finding
+from framework.testing.finding import Finding, describe_error
 from framework.testing.rows import HeadRow
 
 COLUMNS = {
@@ -60,7 +60,15 @@ def run(config: Config) -> None:
     console, lines, failed = PlainConsole(), [], []
     for group, part in chosen:
         plain = {key: value for key, value in part.items() if key != "name"}
-        report, findings, broken = examine(contract(group, part["name"], plain), console)
+        try:
+            report, findings, broken = examine(contract(group, part["name"], plain), console)
+        except UserError:
+            raise
+        except Exception as error:  # such as an error of the constructor
+            raise ContractBroken(
+                f"The {group} {part['name']!r} cannot be checked, because it cannot be built: {describe_error(error)}. "
+                "Mend this line."
+            ) from error
         console.print(report)
         lines += findings
         failed += broken
@@ -69,9 +77,17 @@ def run(config: Config) -> None:
     console.print(f"all findings, with the worst case of each: {config.folder / 'check.csv'}", soft_wrap=True)
     if failed:
         raise ContractBroken(
-            f"{len(failed)} of {len(lines)} checks failed: {', '.join(dict.fromkeys(failed))}. The lines that begin "
-            "with FAILS name the cases; the docstring of the base class in framework/ states the contract."
+            f"{len(failed)} of {len(lines)} checks failed: {_listed(dict.fromkeys(failed))}. The lines that begin with "
+            "FAILS name the cases; begin with the first, which may cause the others. The docstring of the base class "
+            "in framework/ states the contract."
         )
+
+
+def _listed(names: Iterable[str], most: int = 6) -> str:
+    """Return the first `most` names, and the number of the others."""
+    first = list(names)
+    more = f" and {len(first) - most} more" if len(first) > most else ""
+    return ", ".join(first[:most]) + more
 
 
 def examine(plugin: Contract, console: Console) -> tuple[Group, list[dict[str, object]], list[str]]:
@@ -133,11 +149,13 @@ def _report(plugin: Contract, worst: Mapping[str, tuple[Row, Finding]], seconds:
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("verdict", no_wrap=True)
     notes: list[tuple[str, str, str]] = []
+    failures: dict[str, list[str]] = {}
     for name, (row, finding) in worst.items():
         verdict = Text("holds", "green") if finding.holds else Text("FAILS", "bold red")
         table.add_row(name, f"{finding.error:.2g}", f"{finding.limit:g}", verdict)
         if not finding.holds:
-            notes.append(("FAILS", "bold red", f"{name}: {row.name}: {finding.worst}"))
+            failures.setdefault(f"{row.name}: {finding.worst}", []).append(name)
+    notes += [("FAILS", "bold red", f"{', '.join(names)}: {case}") for case, names in failures.items()]
     reasons: dict[str, list[str]] = {}
     for row in plugin.rows:
         for name, reason in row.leave_out.items():

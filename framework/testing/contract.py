@@ -179,7 +179,7 @@ def _defaults(group: str, name: str, config: Mapping[str, Any], label: str) -> t
         raise ConfigError(
             f"The {group} {name!r} has no rows.py and cannot be checked, because it accepts none of the "
             f"{'input shapes' if group == 'encoder' else 'targets'} that mode=check tries for such plugins: "
-            f"{' '.join(refused)} Write a rows.py for the plugin, as framework.testing.rows describes."
+            f"{' '.join(dict.fromkeys(refused))} Write a rows.py for the plugin, as framework.testing.rows describes."
         )
     return tuple(accepted)
 
@@ -233,9 +233,37 @@ def _examine_head(name: str, row: HeadRow) -> Iterator[Finding]:
     def build_for(target: Target) -> Any:
         return fit_if_needed(build("density_head", config, target=target), target)
 
+    _require_density(build_for(row.target))
     subject = HeadSubject(row, lambda: build_for(row.target), build_for=build_for)
     yield from examine_head(subject)
     yield from examine_densities(subject)
+
+
+def _require_density(head: Any) -> None:
+    """Require what every check of a density head needs: a number of raw parameters, and a density for them.
+
+    Raises:
+        ConfigError: The head has no `size`, or `forward` returns something else than a density.
+    """
+    import torch
+    from torch.distributions import Distribution
+
+    kind = type(head).__name__
+    size = getattr(head, "size", None)
+    if not isinstance(size, int) or size < 1:
+        raise ConfigError(
+            f"The constructor of {kind} leaves `size` at {size!r}, but it is the number of raw parameters per sample, "
+            "at least 1. Set `self.size`."
+        )
+    try:
+        density = head.eval()(torch.zeros(2, *head.raw_shape))
+    except Exception:  # the checks report it, with its line
+        return
+    if not isinstance(density, Distribution):
+        raise ConfigError(
+            f"`forward` of {kind} returns an object of type {type(density).__name__}, but a density, which is a "
+            "torch.distributions.Distribution, is required. Return one."
+        )
 
 
 def _examine_encoder(name: str, row: EncoderRow) -> Iterator[Finding]:

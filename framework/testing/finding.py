@@ -180,10 +180,23 @@ def run_check(name: str, limit: float, check: Callable[[Worst], None], *, second
         with at_most(seconds):
             check(worst)
     except Exception as error:
-        message = " ".join(f"{type(error).__name__}: {error}".split())
-        message = message if len(message) <= 300 else message[:297] + "..."
-        return Finding(name, message + _line_of(error), torch.inf, limit)
+        return Finding(name, describe_error(error), torch.inf, limit)
     return worst.finding(name, limit)
+
+
+def describe_error(error: BaseException) -> str:
+    """Return type and message of an error that a plugin raised, and the line of the plugin that raised it.
+
+    An error without a message is described by the function that raised it.
+    """
+    message = " ".join(str(error).split())
+    if not message:
+        *_, (frame, _) = walk_tb(error.__traceback__)
+        owner = frame.f_locals.get("self")
+        if owner is not None:
+            message = f"raised by `{frame.f_code.co_name}` of {type(owner).__name__}"
+    text = f"{type(error).__name__}: {message}" if message else type(error).__name__
+    return (text if len(text) <= 300 else text[:297] + "...") + _line_of(error)
 
 
 def _line_of(error: BaseException) -> str:
