@@ -92,7 +92,7 @@ def with_outputs(text: str, book: Any, name: str, seconds: float, folder: str) -
                 figures += 1
                 file = FOLDER / f"{name}_{figures}.png"
                 file.write_bytes(base64.b64decode(data["image/png"]))
-                parts.append(f"![Output of the cell above]({file.name})")
+                parts.append(f"![{described(match[0])}]({file.name})")
             elif output.output_type == "stream" and output.name == "stdout":
                 printed += output.text
             elif "text/plain" in data:
@@ -109,6 +109,12 @@ def with_outputs(text: str, book: Any, name: str, seconds: float, folder: str) -
         f"{text}\n\n<!-- run -->\n*The outputs on this page are those of a run on {cores} cores on {today}, which took "
         f"{seconds:.0f} s.*\n"
     )
+
+
+def described(cell: str) -> str:
+    """Return a description of the figure that a cell shows, from the name of its file where the cell names one."""
+    name = re.search(r"(\w+)\.(?:png|gif)\b", cell)
+    return f"Figure: {name[1].replace('_', ' ')}" if name else "Images that the cell above draws"
 
 
 def shortened(output: str) -> str:

@@ -136,9 +136,8 @@ def _callback_settings() -> list[Setting]:
 def _note(prefix: str) -> str:
     if prefix == "trainer":
         return (
-            "The keys without a meaning in this table have the one that "
-            "[Lightning's Trainer](https://lightning.ai/docs/pytorch/stable/common/trainer.html) gives them, such as "
-            "`trainer.profiler=simple`."
+            '"As in Lightning" means that [Lightning\'s '
+            "Trainer](https://lightning.ai/docs/pytorch/stable/common/trainer.html) has a parameter of this name."
         )
     if prefix == "optimizer":
         return "The defaults are those of `optimizer=adamw`. `adam` and `sgd` have other ones (`conf/optimizer/`)."
@@ -182,7 +181,10 @@ def model_settings(model: type[BaseModel], file: str, prefix: str = "") -> list[
             in_cell(
                 f"Refused: {UNUSED_BY_TRAINING[key]}."
                 if prefix == "trainer." and key in UNUSED_BY_TRAINING
-                else MEANINGS.get(prefix + key) or texts.get(key) or comments.get(key, "")
+                else MEANINGS.get(prefix + key)
+                or texts.get(key)
+                or comments.get(key)
+                or ("As in Lightning." if prefix == "trainer." else "")
             ),
         )
         for key, field in model.model_fields.items()
