@@ -48,6 +48,12 @@ from framework.training.range_test import RangeTestResult, measure_losses, range
 from framework.training.rank_processes import end_together
 from framework.uncertainty import SelfTraining, outermost, self_training
 
+FEW_STEPS = 200
+"""Number of steps below which a training on a user's data ends with a note.
+
+20 epochs of one batch left the recommended classifier of images at chance on 63 drawings, and 240 steps in
+smaller batches gave the accuracy of the nearest neighbour.
+"""
 PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": PyTorchProfiler}
 """Profilers of Lightning whose report the run folder receives, by the value of `trainer.profiler`."""
 
@@ -198,11 +204,29 @@ def _fit_by_gradient(session: Session, run: Run) -> Fitted:
     session.console.print(
         f"{'stopped early at' if early else 'ended at'} epoch {trainer.current_epoch}, kept {keep.kept_epoch + 1}"
     )
+    is_shortened = {"limit_train_batches", "max_steps", "max_time"} & settings.trainer.keys()
+    if not (early or is_shortened or session.data.synthetic):
+        session.console.print(few_steps(trainer.global_step, trainer.current_epoch), end="", soft_wrap=True)
     if first_rank():
         fill(session.predictor, predictor_weights(read(keep.kept_path)), str(keep.kept_path))
     session.device = trainer.strategy.root_device
     pruned = any(isinstance(callback, StopIfPruned) and callback.pruned for callback in trainer.callbacks)  # type: ignore[attr-defined]
     return Fitted(keep.kept_loss, keep.kept_epoch, pruned)
+
+
+def few_steps(steps: int, epochs: int) -> str:
+    """Return a line that says that a training took few steps; "" if it did not.
+
+    Args:
+        steps: number of steps of the optimizer.
+        epochs: number of epochs.
+    """
+    if steps >= FEW_STEPS:
+        return ""
+    return (
+        f"note: {steps} steps in {epochs} epochs are few for a network. If the loss still falls, raise "
+        "trainer.max_epochs or lower batch_size.\n"
+    )
 
 
 def _find_learning_rate(session: Session, run: Run, fed: Data) -> float:

@@ -230,7 +230,10 @@ def for_training(config: Config) -> Session:
             "`uncertainty`."
         )
     if trains_itself is not None and not resumed:
-        _refuse_training(config, f"{type(trains_itself).__name__} trains its models itself")
+        keys = " and ".join(f"uncertainty.{part['name']}" for part in parts["uncertainty"])
+        _refuse_training(
+            config, f"{type(trains_itself).__name__} trains its models itself, by its own settings in {keys}"
+        )
     if trains_itself is not None and objectives:
         raise ConfigError(
             f"{type(trains_itself).__name__} trains its models itself, so that an objective has no effect. Leave "

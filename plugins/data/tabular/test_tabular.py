@@ -510,6 +510,7 @@ def test_training_test_and_prediction_run_with_every_kind_of_target(tmp_path: Pa
         ]
     process = run_commands(tmp_path, *lines)
     assert process.returncode == 0, process.stdout + process.stderr
+    assert "are few for a network" in process.stdout
     for kind in ("class", "real", "degrees"):
         results = json.loads((tmp_path / kind / "results.json").read_text())
         assert math.isfinite(results["log_likelihood"])

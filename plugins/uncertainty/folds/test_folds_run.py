@@ -74,7 +74,7 @@ def test_a_table_is_learned_with_two_settings(table, task, target):
 @pytest.mark.parametrize(
     "setting, message",
     [
-        ("trainer.max_epochs=3", "Folds trains its models itself"),
+        ("trainer.max_epochs=3", "Folds trains its models itself, by its own settings in uncertainty.folds"),
         ("optimizer.learning_rate=0.1", "Folds trains its models itself"),
         ("objective=[adversarial]", "an objective has no effect"),
     ],
