@@ -539,6 +539,28 @@ def test_a_file_that_is_no_array_gets_a_sentence(content: bytes, tmp_path: Path)
         script.read_array(file, ["batch", 2])
 
 
+def test_words_in_a_file_are_read_as_the_data_set_reads_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script = importlib.import_module("framework.deployment.exported_folder.predict")
+    levels = importlib.import_module("plugins.data.tabular.levels")
+    csv_columns = importlib.import_module("framework.datasets.csv_columns")
+    file = tmp_path / "new.csv"
+    file.write_text("colour,x,note,size=big\nred,3,a,1\n green ,1,b,0\nviolet,2,c,1\n", encoding="utf-8")
+    columns = ["x", "colour=green", "colour=red", "size=big"]
+    rows = script.read_csv(file, columns)
+    assert "does not know the word 'violet' of the column 'colour' (1 rows)" in capsys.readouterr().err
+    cells = levels.add_levels(csv_columns.read_columns(file), columns)
+    expected = np.stack([csv_columns.numbers(cells, name, missing="") for name in columns], -1)
+    np.testing.assert_array_equal(rows, expected)
+    for missing in ("shape=round", "y"):
+        with pytest.raises(ValueError, match=f"has no column '{missing}'"):
+            script.read_csv(file, [*columns, missing])
+    file.write_text("colour,x\nred\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="line 2: a cell is missing or not a number"):
+        script.read_csv(file, ["colour=red", "x"])
+
+
 def test_the_exported_folder_needs_numpy_and_onnxruntime_alone(framework: Framework, tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
     cells = generator.normal(size=(80, 2)) * [1, 50] + [0, 1000]

@@ -20,7 +20,8 @@ import os
 import re
 import sys
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -235,25 +236,57 @@ def read_array(file: Path, shape: list[Any]) -> NDArray[Any]:
 def read_csv(file: Path, columns: list[str]) -> NDArray[np.float64]:
     """Return the named columns of a CSV file with a header, (row, column).
 
+    A column `name=word` that the file does not have is 1 where the column `name` holds the word, and 0 elsewhere. A
+    word that belongs to none of these columns is reported on the error stream.
+
     Raises:
         ValueError: a column is missing, or a cell is not a number.
     """
     with file.open(encoding="utf-8-sig", newline="") as stream:
         reader = csv.DictReader(stream)
-        missing = [name for name in columns if name not in (reader.fieldnames or ())]
-        if missing:
+        sources = [_source_of(name, reader.fieldnames or ()) for name in columns]
+        if None in sources:
             raise ValueError(
-                f"{file} has no column {missing[0]!r}. The model reads the columns {', '.join(columns)}."
+                f"{file} has no column {columns[sources.index(None)]!r}. The model reads the columns "
+                f"{', '.join(columns)}. A column such as colour=red is read from a column of words, colour."
             )
-        rows = []
+        words: dict[str, set[str]] = {}
+        for name, word in filter(None, sources):
+            if word is not None:
+                words.setdefault(name, set()).add(word)
+        rows, unknown = [], Counter[tuple[str, str]]()
         for line in reader:
             try:
-                rows.append([float(line[name]) for name in columns])
-            except (TypeError, ValueError):
+                rows.append(
+                    [
+                        float(line[name]) if word is None else float(line[name].strip() == word)
+                        for name, word in filter(None, sources)
+                    ]
+                )
+                unknown.update(
+                    (name, cell) for name in words if (cell := line[name].strip()) not in words[name]
+                )
+            except (AttributeError, TypeError, ValueError):
                 raise ValueError(
-                    f"{file}, line {reader.line_num}: a cell is not a number. Correct the line."
+                    f"{file}, line {reader.line_num}: a cell is missing or not a number. Correct the line."
                 ) from None
+    for (name, cell), count in unknown.items():
+        sys.stderr.write(
+            f"{file}: the model does not know the word {cell!r} of the column {name!r} ({count} rows); it is read as "
+            "none of the known words.\n"
+        )
     return np.array(rows, dtype=np.float64).reshape(-1, len(columns))
+
+
+def _source_of(name: str, header: Sequence[str]) -> tuple[str, str | None] | None:
+    """Return the column of a file from which the column `name` is read, and the word that counts as 1, if any.
+
+    The result is None if the file has no such column.
+    """
+    if name in header:
+        return name, None
+    column, sign, word = name.partition("=")
+    return (column, word) if sign and column in header else None
 
 
 def padded(clouds: Any) -> NDArray[Any]:
