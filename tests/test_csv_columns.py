@@ -77,7 +77,7 @@ def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
     ("cell", "message"),
     [
         ("abc", r"line 4, column 'a': 'abc' is not a finite number"),
-        ("", r"line 4, column 'a': '' is not a finite number.* Or set it to skip\."),
+        ("", r"line 4, column 'a': The cell is empty, but a finite number.* Or set it to skip\."),
         ("NA", r"'NA' is not a finite number.* Or set it to skip\."),
         ("nan", r"'nan' is not a finite number.* Or set it to skip\."),
         (

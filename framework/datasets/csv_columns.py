@@ -604,10 +604,14 @@ def numbers(
     for row, cell in enumerate(columns.cells[name]):
         value = BOOLEANS.get(cell.lower(), math.nan) if booleans else number(cell, notation)
         if value is None or math.isinf(value) or (missing is not None and math.isnan(value)):
+            fault = (
+                f"{quote(cell)} is not a finite number, which"
+                if cell
+                else "The cell is empty, but a finite number"
+            )
             raise DataError(
-                f"{columns.file} line {columns.lines[row]}, column {quote(name)}: {quote(cell)} is not a finite "
-                "number, which is required. Correct the cell, or remove the "
-                f"line.{_hint(cell, value, columns, missing)}"
+                f"{columns.file} line {columns.lines[row]}, column {quote(name)}: {fault} is required. Correct the "
+                f"cell, or remove the line.{_hint(cell, value, columns, missing)}"
             )
         values[row] = value
     _check_units(columns, name)

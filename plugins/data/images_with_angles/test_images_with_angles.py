@@ -97,7 +97,7 @@ def table_with(line: str, header: str = "file,pan,tilt", index: int = 3) -> str:
         ("file,pan,pan\n000.png,3,4", r"the column 'pan' is named twice"),
         ("file,note\n000.png,hello", r"has no column of numbers besides `file` and `split`"),
         (table_with("777.png,abc,4"), r"line 5, column 'pan': 'abc' is not a finite number"),
-        (table_with("777.png,,4"), r"line 5, column 'pan': '' is not a finite number"),
+        (table_with("777.png,,4"), r"line 5, column 'pan': The cell is empty, but a finite number"),
         (table_with("777.png,1_0,4"), r"line 5, column 'pan': '1_0' is not a finite number"),
         (table_with("777.png,3,nan"), r"line 5, column 'tilt': 'nan' is not a finite number"),
         (table_with("777.png,-inf,3"), r"line 5, column 'pan': '-inf' is not a finite number"),

@@ -170,7 +170,7 @@ def with_cell(cell: str, line: int = 5, column: int = 0) -> str:
         (with_cell("abc"), r"mine\.csv line 5, column 'x': 'abc' is not a finite number"),
         (
             with_cell(""),
-            r"line 5, column 'x': '' is not a finite number.* Or set data\.missing=skip to leave such rows out",
+            r"line 5, column 'x': The cell is empty, but .* Or set data\.missing=skip to leave such rows out",
         ),
         (with_cell("nan", 7, 1), r"line 7, column 'y': 'nan' is not a finite number"),
         (with_cell("-inf", 7, 1), r"line 7, column 'y': '-inf' is not a finite number"),
@@ -420,7 +420,9 @@ def test_read_uses_the_training_rows_and_needs_no_prepare(tmp_path: Path) -> Non
     ):
         fresh.read([other])
     other.write_text("number,square\n3,9\n4,\n")
-    with pytest.raises(DataError, match=r"other\.csv line 3, column 'square': '' is not a finite number"):
+    with pytest.raises(
+        DataError, match=r"other\.csv line 3, column 'square': The cell is empty, but a finite number"
+    ):
         fresh.read([other])
 
 

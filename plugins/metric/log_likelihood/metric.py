@@ -9,6 +9,7 @@ from torch import Tensor
 
 from framework.distributions.checks import refuse_nan
 from framework.distributions.protocol import Estimate
+from framework.errors import shorten
 from framework.metric import Directions, Metric
 from framework.prediction import Prediction
 
@@ -111,7 +112,7 @@ def warn_of_unlikely(prediction: Prediction) -> None:
         len(below),
         UNLIKELY,
         int(index),
-        ", ".join(f"{value:.4g}" for value in prediction.target[row].tolist()),
+        shorten(", ".join(f"{value:.4g}" for value in prediction.target[row].tolist()), 80),
         float(log_prob[row]),
     )
 

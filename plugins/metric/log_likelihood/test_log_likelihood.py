@@ -257,3 +257,10 @@ def test_targets_far_below_the_median_are_reported(caplog):
     assert len(caplog.messages) == 1
     assert "1 of 3 targets are more than 20 nats less likely" in caplog.messages[0]
     assert "test sample 1, target 0, with -21.5 nats" in caplog.messages[0]
+
+
+def test_a_target_of_many_numbers_is_shortened(caplog):
+    metric = LogLikelihood()
+    density = KnownLikelihood(torch.tensor([-1.0, -21.5, 0.0]))
+    metric.update(Prediction(density, {"target": torch.arange(300.0).reshape(3, 100)}))
+    assert len(caplog.messages[0]) < 500 and "target 100, 101, 102" in caplog.messages[0]
