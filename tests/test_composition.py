@@ -74,6 +74,16 @@ def test_an_experiment_in_a_folder_of_the_user_derives_from_one_of_the_project(
     assert own == plain(composed(f"experiment={base}")) | {"batch_size": 7}
 
 
+def test_the_experiment_file_of_the_documentation_composes(tmp_path: Path) -> None:
+    text = (folder().parent / "docs/how_to/own_experiment.md").read_text(encoding="utf-8")
+    example = re.search(r"(?ms)^```yaml\n(.*?)^```$", text)
+    assert example
+    (tmp_path / "experiment/mine").mkdir(parents=True)
+    (tmp_path / "experiment/mine/wide.yaml").write_text(example[1], encoding="utf-8")
+    own = plain(composed("experiment=mine/wide", f"hydra.searchpath=[file://{tmp_path}]"))
+    assert own["encoder"]["mlp"]["widths"] == [256, 256] and own["optimizer"]["name"] == "sgd"
+
+
 def test_the_project_names_the_bases_of_its_experiments_from_the_root() -> None:
     """Hydra reads a name without the group as a name below the folder of the experiment that derives from it."""
     relative = [
