@@ -144,7 +144,8 @@ class Data(ABC):
 
         Raises:
             DataError: the root is missing, the layout is wrong, a file is unreadable, a label is not finite, or a split
-                is empty.
+                is empty. For an unreadable file, the message names the setting that leaves such files out, if there is
+                one.
         """
 
     def check_files(self) -> None:  # noqa: B027 - most data sets have nothing to check

@@ -111,7 +111,10 @@ class Needles(Data):
             if self.fault == "an error of Python's":
                 raise
             name = "a file" if self.fault == "bad files have no name" else file
-            raise DataError(f"{name} cannot be read ({error}); wanted {count} numbers. Mend it.") from error
+            remedy = (
+                "Mend it." if self.fault == "the remedy is not named" else "Mend it, or set data.skip=true."
+            )
+            raise DataError(f"{name} cannot be read ({error}); wanted {count} numbers. {remedy}") from error
         return numbers
 
     def fields(self, table):
@@ -249,6 +252,7 @@ FAULTS = {
     "bad files have no name": "damaged files are named",
     "an error of Python's": "damaged files are named",
     "nothing is counted": "files left out are counted",
+    "the remedy is not named": "files left out are counted",
     "pictures of floats": "pictures",
     "grey pictures": "pictures",
     "pictures change the input": "pictures",

@@ -196,7 +196,8 @@ class DataRow(Row):
             must raise an error that names the file. Leave out damage that cannot be detected: for example, half of a
             list of names is still a list of names.
         skip: Parameters with which the data set skips and counts unreadable files. One file of the first pattern in
-            `fragile` is made unreadable for this check.
+            `fragile` is made unreadable for this check. Without these parameters, the error must name each of them,
+            such as `data.unreadable=skip`.
         changes: Parameters, each with a value that changes the samples and therefore the fingerprint.
     """
 
