@@ -1,6 +1,5 @@
 """Budgets: the cheapest setting of a model's knobs that meets a limit, and the refusal of limits that cannot be met."""
 
-import time
 from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any, ClassVar, cast
@@ -16,6 +15,7 @@ from framework.data import Data
 from framework.datasets.fields import Fields
 from framework.density_head import DensityHead
 from framework.errors import ConfigError
+from framework.evaluation import cost
 from framework.evaluation.budget import Bench, Errors, meet_budget
 from framework.model import Model
 from framework.target import Target
@@ -27,8 +27,12 @@ SECONDS = 0.004
 """Time that one sample of `Slow` takes, for a batch; with batches of ten, 0.4 ms per sample of the data."""
 
 
+CLOCK = SimpleNamespace(now=0.0)
+"""Clock of the run times, which `Slow` advances, so that they do not depend on other programs."""
+
+
 class Slow(DensityHead):
-    """A normal density whose location is wrong by 1 / samples; each sample takes `SECONDS`."""
+    """A normal density whose location is wrong by 1 / samples; each sample takes `SECONDS` of `CLOCK`."""
 
     bibtex = ""
     size = 1
@@ -36,7 +40,7 @@ class Slow(DensityHead):
     samples, useful = 8, 8
 
     def forward(self, raw: torch.Tensor) -> Distribution:
-        time.sleep(SECONDS * self.samples)
+        CLOCK.now += SECONDS * self.samples
         wrong = 1 / min(self.samples, self.useful)
         return Independent(Normal(torch.full_like(raw, wrong), 1.0), 1)
 
@@ -55,7 +59,9 @@ def meet(predictor: Model, location: float = 0.0, spread: float = 0.0, **budget:
     data = SimpleNamespace(splits=lambda: SimpleNamespace(validation=Fields(**fields)))
     metrics = [build("metric", resolve("metric", "nll"), target=TARGET)]
     limits = BudgetSettings.model_validate(check(BudgetSettings, {"batch_size": 10, **budget}, "budget"))
-    return meet_budget(predictor, cast(Data, data), metrics, limits, samples=3, seed=0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cost, "time", SimpleNamespace(perf_counter=lambda: CLOCK.now))
+        return meet_budget(predictor, cast(Data, data), metrics, limits, samples=3, seed=0)
 
 
 @pytest.mark.parametrize(

@@ -80,5 +80,5 @@ def test_inputs_of_the_model_are_taken_as_they_are(data: Data) -> None:
     ids=lambda given: type(given).__name__,
 )
 def test_what_is_no_image_is_refused(given: Any, data: Data) -> None:
-    with pytest.raises(DataError, match=r"[Ee]xpected|[Gg]ive|required|reads|Copy"):
+    with pytest.raises(DataError, match=r"[Ee]xpected|[Gg]ive|required|reads|Copy|Name a file"):
         data.inputs(given)
