@@ -217,5 +217,5 @@ def on_page_markdown(markdown: str, page: "Page", config: "MkDocsConfig", files:
     boosts = [boost for beginning, boost in BOOSTS.items() if target.startswith(beginning)]
     page.meta["search"] = {"boost": boosts[0] if boosts else 3.0}
     if WIDE.search(markdown):
-        page.meta["hide"] = ["toc"]  # its column gives the tables a third more width
+        page.meta["hide"] = ["toc"]  # without the table of contents, tables are a third wider
     return spaced_lists(markdown)

@@ -1,4 +1,4 @@
-"""The methods: one self-contained folder each, found by entry points, never imported by the core."""
+"""Plugins, one self-contained folder for each; the core finds them by entry points and imports none by name."""
 
 import os
 import sys

@@ -85,7 +85,7 @@ class Sweep:
         """Wait until every job has sent `LINES` lines, and return how long it took and how many jobs were running.
 
         Raises:
-            RuntimeError: A job has already ended, so that the store would not be away during its training.
+            RuntimeError: A job has already ended, so that stopping the store now would not affect its training.
         """
         while not all(_sent(job) >= LINES for job in self.jobs):
             if self.process.poll() is not None:

@@ -119,13 +119,12 @@ def winners(runs: Mapping[str, list[tuple[Path, Mapping[str, Any]]]], costs: Map
     for method in sorted(runs, key=lambda method: costs[method]):
         if gaps[method] < best:
             best = gaps[method]
-            parts.append(
-                f"{NAMES[method]} from {costs[method]:.2g} ms per image on (distance {best:.2f} nats)"
-            )
+            parts.append(f"{costs[method]:.2g} ms, {NAMES[method]} (distance {best:.2f} nats)")
     beaten = [NAMES[method] for method in runs if not any(NAMES[method] in part for part in parts)]
     return (
-        f"the method that is nearest to the exact density is {'; '.join(parts)}. Each of the other methods "
-        f"({', '.join(beaten)}) is slower than one of these and not nearer."
+        "if a prediction may take at least the following time per image, the method that is nearest to the exact "
+        f"density is: {'; '.join(parts)}. Each of the other methods ("
+        f"{', '.join(beaten)}) is slower than one of these and not nearer."
     )
 
 
@@ -366,9 +365,9 @@ et al. 2021. Higher is better.
 all methods in interleaved rounds. "minutes" is the whole command with training and test, on one thread while other work
 ran on the machine. Every method has the same network and
 the same 8 epochs (2,500 steps); Murphy et al. 2021 train for 100,000 steps. The mixture has three components for each
-of the 24 equivalent rotations of a cube. 24 are not enough: while a cube turns until it looks the same again, its
-equivalent rotations change places, so that no 24 continuous functions of the image can follow them. The number was
-chosen on validation images of a cube ([mixture](../../plugins/density_head/mixture/README.md)).
+of the 24 equivalent rotations of a cube. 24 components are not enough: while a cube turns until it looks the same
+again, its equivalent rotations change places, so that no 24 continuous functions of the image can follow them. The
+number was chosen on validation images of a cube ([mixture](../../plugins/density_head/mixture/README.md)).
 
 ![Distance from the exact density against milliseconds per image](symmetric_solids_cost.png)
 

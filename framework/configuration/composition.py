@@ -97,7 +97,10 @@ def in_quotes(text: str) -> str:
 
 
 def _escape_quote(match: re.Match[str]) -> str:
-    """Return backslashes and a quotation mark as they stand in quotes: backslashes count only before the mark."""
+    """Return backslashes and a quotation mark, escaped for a text in quotes.
+
+    Backslashes are doubled only before a quotation mark and at the end of the text, where they would escape the mark.
+    """
     if match[0] == "'":
         return "\\'"
     return match[1] if match[2] is None else 2 * match[1] + ("\\'" if match[2] else "")

@@ -142,7 +142,7 @@ def load(group: str, name: str) -> type[Any]:
 
 
 def _import_line(error: Exception) -> str:
-    """Return " (at <file>:<line>)" of the line that failed; "" for a syntax error, whose message has it."""
+    """Return " (at <file>:<line>)", the line of a plugin that failed; "" for none, or if a syntax error names it."""
     lines = [
         f" (at {frame.f_code.co_filename}:{line})"
         for frame, line in walk_tb(error.__traceback__)

@@ -151,7 +151,7 @@ def build(group: str, config: Mapping[str, Any], **context: Any) -> Any:
             f"{group} {config['name']} refuses {parameters or 'its arguments'}: {shorten(error)} (ValueError at "
             f"{_error_line(error, cls)})."
         ) from error
-    if hasattr(cls, "register_buffer") and "_modules" not in vars(plugin):  # a torch.nn.Module
+    if hasattr(cls, "register_buffer") and "_modules" not in vars(plugin):  # its Module part was not built
         raise ConfigError(
             f"The constructor of {cls.__name__}, the {group} {config['name']!r}, does not call that of its base class. "
             "Write `super().__init__()` as its first line."

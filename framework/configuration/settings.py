@@ -424,7 +424,7 @@ class Settings(_Strict):
 
     @property
     def is_short_test(self) -> bool:
-        """Return whether the run only tries all of its stages (`debug=fast`), with at most ten batches of training."""
+        """Return whether the run trains on at most ten batches, as with `debug=fast`, which only tries all stages."""
         batches, epochs = self.trainer.get("limit_train_batches"), self.trainer.get("max_epochs")
         return isinstance(batches, int) and isinstance(epochs, int) and batches * epochs <= 10
 

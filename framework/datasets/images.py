@@ -144,7 +144,10 @@ def open_image(file: Path) -> Iterator[Image.Image]:
 
 
 def _read_at_once(stream: reading.Bounded) -> BinaryIO | BytesIO:
-    """Return the bytes of a small file in memory, because Pillow reads a file in dozens of pieces; else the file."""
+    """Return a small file as bytes in memory, and a larger file unchanged.
+
+    Pillow reads a file in dozens of pieces, which is faster from memory.
+    """
     small = os.fstat(stream.fileno()).st_size <= READ_AT_ONCE
     return BytesIO(stream.read()) if small else stream
 
@@ -152,7 +155,8 @@ def _read_at_once(stream: reading.Bounded) -> BinaryIO | BytesIO:
 def advise_missing(file: Path) -> str:
     """Return advice about an image that does not exist, for a similar path that exists; "" if none is known.
 
-    The similar paths are those with / for each backslash, with a suffix of images, and in a folder beside the file.
+    A similar path has / in place of each backslash, or the suffix of an image after the name, or lies in a subfolder of
+    the folder of `file`.
     """
     if file.exists():
         return ""
@@ -213,7 +217,7 @@ def _require_bounded_icon(stream: BinaryIO | BytesIO) -> None:
             content = stream.read(24)
             of_png = content.startswith(b"\x89PNG")
             sides = struct.unpack(">II", content[16:24]) if of_png and len(content) == 24 else ()
-            if not of_png and len(content) >= 12:  # a bitmap, which counts the rows of its mask too
+            if not of_png and len(content) >= 12:  # a bitmap; its height counts the rows of its mask too
                 sides = struct.unpack("<ii", content[4:12])
             if abs(math.prod(sides)) > MOST_ICON:
                 raise ValueError(
@@ -536,7 +540,7 @@ def load_splits(
         fields: further fields of each split, by the split's name.
         faults: errors of further samples, which have no crop because their labels could not be read.
         skip_unreadable: leave out samples that cannot be read.
-        skip_setting: setting of the data set that leaves them out, for the message.
+        skip_setting: setting of the data set that leaves out unreadable samples, for the message.
         generated_in: the cache folder of generated images; None: the images are the user's.
 
     Raises:

@@ -502,7 +502,8 @@ class Trial:
         density: the densities of the original model.
         outputs: parameters of the density by name, from the exported model.
         own: parameters of the density by name, from the original model.
-        double: function that returns those of the original model in float64; None if it cannot compute in float64.
+        double: function that returns the parameters from the original model in float64, or None if this model cannot
+            compute in float64.
     """
 
     density: torch.distributions.Distribution

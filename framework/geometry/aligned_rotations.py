@@ -309,7 +309,7 @@ def _ratio(circle: _Circle) -> Tensor:
 
 
 def _with_series(name: str, circle: _Circle, close: Tensor) -> Tensor:
-    """Return `close`, with the asymptotic series where κ is too large to compute 1 - A(κ) by subtraction."""
+    """Return `close`, replaced by the asymptotic series where κ is too large to compute 1 - A(κ) by subtraction."""
     far = ~(circle.concentration < LARGE)
     # the series is evaluated only where it applies, which is at a minority of the nodes
     return close.masked_scatter(far, _series(name, circle.concentration[far]))

@@ -77,7 +77,8 @@ class MatrixHead(DensityHead):
         """Return √3 R for `count` rotations R that are far from one another, all turned by one random rotation.
 
         Independent numbers from N(0, 1) would leave large gaps between the modes, and most of the matrices would give
-        densities that are wide about one axis. |√3 R|² = 9 is the mean square of their norm.
+        densities that are wide about one axis. The squared norm |√3 R|² = 9 is the mean
+        squared norm of nine independent numbers from N(0, 1).
         """
         turn = torch.nn.functional.normalize(torch.randn(4), dim=0).double()
         spread = quaternions.product(turn, distant_rotations(count))

@@ -189,7 +189,7 @@ def blame_checkpoint(checkpoint: Path | None, training: "Training") -> Iterator[
     Raises:
         CheckpointError: The training cannot continue from the checkpoint.
     """
-    import torch  # a command that is refused does not need it
+    import torch  # imported late: a refused command does not need it
 
     try:
         yield

@@ -97,7 +97,7 @@ class Document:
         return self.read_file(resolve_beside(self.folder, unquote(address, errors="surrogateescape")))
 
     def read_file(self, file: Path) -> bytes:
-        """Return the content of a file beside this file, and add its size to `size`."""
+        """Return the content of a file that the glTF file names, and add the number of its bytes to `size`."""
         with translate_errors(file, "a part of a glTF file"):
             data = read_bytes(file)
         self.size += len(data)

@@ -126,7 +126,7 @@ def require_inside_data(file: str | os.PathLike[str]) -> None:
 
 @lru_cache(maxsize=4096)
 def _real_folder(folder: str) -> str:
-    """Return the path of a folder without links; most files share their folder with others."""
+    """Return the path of a folder without links. Results are kept, because many files lie in one folder."""
     return os.path.realpath(folder)
 
 

@@ -111,7 +111,7 @@ def _may_fork() -> bool:
 
 def _draw_in_processes(count: int, draw: Callable[[int], Result], work: str) -> list[Result]:
     """Draw the files in PAINTERS processes, one of which is this process; `draw_all` describes the rest."""
-    first = draw(0)  # compiles functions once, for all processes
+    first = draw(0)  # before the forks, so that functions are compiled once
     fork, parent = get_context("fork"), os.getpid()
     pipes = [fork.Pipe(duplex=False) for _ in range(PAINTERS - 1)]
     painters = [
@@ -129,7 +129,7 @@ def _draw_in_processes(count: int, draw: Callable[[int], Result], work: str) -> 
             sending.close()  # so that the end of the process ends the pipe
         own = range(1, count, PAINTERS)
         results = {0: first}
-        # the files that the other processes have drawn meanwhile, and the first one
+        # number of files that all processes have drawn when this one is done; file 0 is counted with file 1
         sizes = {number: min(PAINTERS, count - number) + (number == 1) for number in own}
         for number in track_progress(own, work, count, "files", sizes.__getitem__):
             results[number] = draw(number)

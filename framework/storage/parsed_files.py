@@ -47,7 +47,7 @@ class ParsedFiles(Generic[Content]):
     """Contents of the files in one folder, as far as the files have not changed since an earlier command parsed them.
 
     The cache holds the contents in one JSON file with a checksum. This file is ignored if it is damaged. It is not used
-    after a change of the sources, because the parser may then read the files differently.
+    after a change of `sources`, because the parser may then read the files differently.
 
     Args:
         folder: Folder of the files.
@@ -62,7 +62,7 @@ class ParsedFiles(Generic[Content]):
         key.update(os.fsencode(folder.resolve()))
         self._name = f"{name}-{key.hexdigest()[:32]}.json"
         self._adapter: TypeAdapter[dict[str, tuple[Stamp, Content]]] = TypeAdapter(
-            dict[str, tuple[Stamp, content]],  # pyright: ignore[reportInvalidTypeForm]  # known only here
+            dict[str, tuple[Stamp, content]],  # pyright: ignore[reportInvalidTypeForm]  # known only at run time
             config=ConfigDict(ser_json_inf_nan="constants"),
         )
         self._contents: dict[str, tuple[Stamp, Content]] = {}

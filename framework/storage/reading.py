@@ -80,11 +80,11 @@ def open_regular(file: Path) -> "Bounded":
 def require_stored(descriptor: int) -> None:
     """Refuse an open file that is sparse and has far more bytes than are stored.
 
-    An archive of a kilobyte can contain a sparse file of a terabyte, which takes no place on the disk. Reading it would
-    take a terabyte of memory.
+    An archive of a kilobyte can contain a sparse file of a terabyte, which takes almost no space on the disk. Reading
+    it would take a terabyte of memory.
 
     Raises:
-        ValueError: The file has more than `most_decompressed` bytes for those that are stored.
+        ValueError: The file has more bytes than `most_decompressed` allows for its stored bytes.
     """
     status = os.fstat(descriptor)
     if status.st_size <= most_decompressed(512 * status.st_blocks):
@@ -97,11 +97,11 @@ def require_stored(descriptor: int) -> None:
             end = os.lseek(descriptor, start, os.SEEK_HOLE)
             stored += end - start
     except OSError as error:
-        if error.errno != errno.ENXIO:  # the file system does not tell; ENXIO: no data follow
+        if error.errno != errno.ENXIO:  # not ENXIO (no data follow): the holes are not known
             return
         raise ValueError(
             f"the file is sparse: of its {status.st_size} bytes only {stored} are stored, but at least one in "
-            f"{MOST_TIMES} is required. Copy it with `cp --sparse=never` if its zeros are meant"
+            f"{MOST_TIMES} is required. Copy it with `cp --sparse=never` if the zeros are data"
         ) from None
     finally:
         os.lseek(descriptor, position, os.SEEK_SET)

@@ -56,7 +56,7 @@ class Measured:
     Attributes:
         metrics: Key of each metric in results.json; None: the number that a job returns.
         headings: Heading of each metric.
-        ways: Direction in which each metric is better; None if no trial has results that say so.
+        ways: Direction in which each metric is better; None if the results of no trial state it.
         values: Values of each trial, one for each metric; NaN without a value.
         results: Content of results.json of each trial; empty if there is none.
     """

@@ -25,7 +25,7 @@ _PAUSE = 0.1
 
 
 def start_guard() -> subprocess.Popen[bytes]:
-    """Start the process, whose input is open as long as this process lives."""
+    """Start the guard; its input stays open as long as the process that calls this function lives."""
     return subprocess.Popen(
         _COMMAND,
         stdin=subprocess.PIPE,
@@ -56,7 +56,7 @@ def end_cluster(token: str, patience: float = ENDING) -> None:
 
 
 def cluster_processes(token: str) -> list[int]:
-    """Return the ids of Ray's processes on this machine that have a token in their environment."""
+    """Return the ids of Ray's processes on this machine that have `token` in their environment."""
     spec = find_spec("ray")
     package = None if spec is None else f"{Path(str(spec.origin)).parent}{os.sep}"
     entry, processes = f"{_TOKEN}={token}".encode(), []

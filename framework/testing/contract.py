@@ -257,7 +257,7 @@ def _require_density(head: Any) -> None:
         )
     try:
         density = head.eval()(torch.zeros(2, *head.raw_shape))
-    except Exception:  # the checks report it, with its line
+    except Exception:  # the checks report this error, with its line
         return
     if not isinstance(density, Distribution):
         raise ConfigError(

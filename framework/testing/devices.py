@@ -207,12 +207,13 @@ class OneDevice(TorchFunctionMode):
     def _label_on_cpu(self, result: Any, sources: Sequence[Tensor] = ()) -> None:
         """Give tensors the label "on the CPU", unless a calling function has separate code for each kind of device.
 
-        Such a function may create tensors and read constants in its code for the CPU only. What it computes from
-        tensors that others created on the CPU is on the CPU in any case.
+        In its code for the CPU, such a function may create tensors and read constants. Tensors are labelled in any case
+        if they are computed from a tensor whose place of creation is known.
 
         Args:
             result: the tensors.
-            sources: tensors on the CPU from which the tensors are computed; empty if they are created or moved there.
+            sources: tensors on the CPU from which `result` is computed; empty if `result` was created on the CPU or
+                moved to it.
         """
         tensors = [tensor for tensor in tensors_in(result) if _on_device.get(tensor) is not False]
         places = [_created_at[tensor] for tensor in sources if tensor in _created_at]

@@ -43,8 +43,8 @@ DRAWS = 8
 class Network(nn.Module):
     """Small network with batch norm, which has state, and dropout, which draws random numbers.
 
-    It returns the `simplest_density` for the target, with the location or the logits, and the breadth, that its last
-    layer gives.
+    It returns the `simplest_density` for the target. Its last layer computes the location (of classes: the logits) and
+    the breadth of this density.
 
     Attributes:
         gain: Factor on the raw parameters, which can make them extreme.

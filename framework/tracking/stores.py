@@ -206,7 +206,7 @@ def without_password(text: str) -> str:
     text = re.sub(r"([^\s@]++)(@?)", _without_user, text)
     kept, end = [], 0
     for key in _secret_keys(text):
-        if key.start() >= end:  # no part of a value that is removed
+        if key.start() >= end:  # otherwise the key is part of a value that is removed
             kept.append(text[end : key.end()])
             value = _VALUE.match(text, key.end())
             end = key.end() if value is None else value.end()
@@ -214,7 +214,7 @@ def without_password(text: str) -> str:
 
 
 def _without_user(match: re.Match[str]) -> str:
-    """Return what stands before an "@" without a user name and a password that contains a slash."""
+    """Return the text of a match; if an address in it has a password with a slash, remove user name and password."""
     begun = _USER_WITH_SLASH.search(match[1]) if match[2] else None
     return match[0] if begun is None else match[1][: begun.end(1)]
 

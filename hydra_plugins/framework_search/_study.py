@@ -369,7 +369,10 @@ class Study:
 
     @contextmanager
     def _reached(self) -> Iterator[None]:
-        """Convert the errors of a file from an untrusted source, or of a database that cannot be reached."""
+        """Convert errors inside the block to errors with a sentence for users.
+
+        They come from a file of an untrusted source, or from a database that cannot be reached.
+        """
         from sqlalchemy.exc import SQLAlchemyError
 
         try:

@@ -4,9 +4,10 @@
 
 The test kills a command up to eight times, lets it finish, and compares what it has written, to the last bit, with the
 same command without a kill (`tests.fuzz.kills`). SLURM is included if its programs are on PATH. The folder keeps the
-counts, so that the command can be stopped and repeated. The kinds of kills that have the smallest part of their share
-come first; benchmarks/framework/soak.json holds the kills of all tests so far, which count as well. When all kills are
-made, the script writes soak.json and soak.md there. With --page it writes them earlier.
+counts, so that the command can be stopped and repeated. Each kind of kill has a share of all kills, and
+the kind that has made the smallest part of its share comes next. benchmarks/framework/soak.json holds the kills of all
+tests so far, which count as well. The script writes soak.json and soak.md there: when all kills are made (unless --only
+chose some kinds), or at its end if --page is given.
 """
 
 import argparse

@@ -47,8 +47,8 @@ class Queries:
 
     Attributes:
         points: coordinates of the queries, finite.
-        once: true if the queries are used for one batch only; then they are packed fast, since packing them well would
-            take longer than it saves.
+        once: true if the queries are used for one batch only; `packed` then has a form that is
+            computed fast, because the form for many batches would take longer to compute than it saves.
     """
 
     points: Float[Tensor, "query 3"]

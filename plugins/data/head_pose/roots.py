@@ -52,8 +52,9 @@ def idiap_row(number: int) -> Row:
 
 
 def save_idiap(file: Path, *, column: bool = True, **structs: Sequence[Row]) -> None:
-    """Write a file as MATLAB 7.3 writes struct arrays: the values in #refs#, and fields of references to the values.
+    """Write a file in the layout of MATLAB 7.3 for struct arrays.
 
+    The group `#refs#` holds the values, and each field of a struct array is an array of references to these values.
     Text is a column of UTF-16 code units. The references of a field form a column if `column` is true, otherwise a row.
     """
     with h5py.File(file, "w", userblock_size=512) as content:

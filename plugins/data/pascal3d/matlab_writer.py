@@ -1,6 +1,6 @@
 """Writer of MATLAB 5 files that hold one struct of numbers, texts and structs.
 
-SciPy's writer takes five times as long, an eighth of the time that a generated image takes. The bytes are the same.
+SciPy's writer writes the same bytes, but takes five times as long, which is an eighth of the time of a generated image.
 Source of the format: MathWorks, "MAT-File Format" (R2023b).
 """
 
@@ -59,7 +59,7 @@ def _struct_array(entries: Sequence[Struct], name: str = "") -> bytes:
 
 
 def _matrix(kind: int, columns: int, content: bytes, name: str = "") -> bytes:
-    """Return an array of one row; an array without columns has no rows either."""
+    """Return the bytes of an array of one row; an array without columns has no rows either."""
     flags = struct.pack("<IIII", UNSIGNED, 8, kind, 0)
     shape = struct.pack("<IIii", INT32, 8, min(columns, 1), columns)
     whole = flags + shape + _element(INT8, name.encode()) + content
@@ -67,7 +67,7 @@ def _matrix(kind: int, columns: int, content: bytes, name: str = "") -> bytes:
 
 
 def _element(kind: int, data: bytes) -> bytes:
-    """Return a data element; at most four bytes of data stand in its tag."""
+    """Return the bytes of a data element; data of at most four bytes are part of its tag."""
     if len(data) <= 4:
         return struct.pack("<HH4s", kind, len(data), data)
     return struct.pack("<II", kind, len(data)) + data + bytes(-len(data) % 8)

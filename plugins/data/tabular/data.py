@@ -48,8 +48,8 @@ class Tabular(Data):
         target: The column to predict, or several columns if they hold numbers.
         kind: Kind of the target: a class label, a real number, or an angle in degrees or radians.
         columns: Columns of the input; None for every other column whose cells are mostly numbers.
-        validation: Share of the rows for validation, chosen at random, if there is no column `split`; of the training
-            rows, if this column names no row for validation.
+        validation: Share of the rows for validation, chosen at random, if there is no column `split`. If this column
+            names no row for validation, it is the share of the training rows that is used for validation.
         test: Share of the rows for the test, chosen at random, if there is no column `split`; 1 makes all rows of a
             table test rows, for a model that was trained on another table.
         data_seed: Seed of the choice of these rows, independent of the seed of the run.

@@ -411,7 +411,7 @@ def _targets(cells: Columns, question: Question, skip_remedy: str | None) -> tup
         for name in question.target:
             if is_boolean(cells, name):
                 raise DataError(
-                    f"{cells.file}, column {name!r}: The column holds two words such as {cells.cells[name][0]!r}, but "
+                    f"{cells.file}, column {name!r}: The column holds only TRUE and FALSE, but "
                     f"data.kind={question.kind} requires numbers. Set data.kind=class, or name another data.target."
                 )
             if words := describe_words(cells, name):
@@ -511,7 +511,7 @@ def _splits(
             split[random.permutation(training)[: round(question.validation * len(training))]] = 1
             remarks = (
                 f"the column `{SPLIT}` names no row for validation: {(split == 1).sum()} of {len(training)} training "
-                f"rows are, data.validation={question.validation:g}",
+                f"rows are used for validation, because data.validation={question.validation:g}",
             )
         remedy = f"Assign rows to this split in the column `{SPLIT}`."
     elif question.test == 1:
@@ -559,7 +559,7 @@ def _stated_splits(cells: Columns, rows: np.ndarray) -> Int[np.ndarray, "row"]:
 
 
 def _keep_training_rows(split: Int[np.ndarray, "row"], labels: np.ndarray) -> tuple[str, ...]:
-    """Move the first row of each class without a training row to the training split; return a remark about them.
+    """Move the first row of each class without a training row to the training split; return a remark about these rows.
 
     `split` is changed in place. Nothing is moved if the labels may not be meant as classes: more than two numbers, or
     very many words.

@@ -253,7 +253,10 @@ def test_without_rows_for_validation_a_share_of_the_training_rows_is_chosen(tmp_
     assert [len(lines[name]) for name in SPLITS] == [24, 6, 10]
     assert sorted(lines["test"]) == list(range(0, 40, 4))
     assert len(np.unique(np.concatenate([*lines.values()]))) == 40
-    assert any("6 of 30 training rows are, data.validation=0.2" in remark for remark in data.remarks)
+    assert any(
+        "6 of 30 training rows are used for validation, because data.validation=0.2" in remark
+        for remark in data.remarks
+    )
 
 
 def test_a_trained_model_is_tested_on_all_rows_of_another_table(tmp_path: Path) -> None:

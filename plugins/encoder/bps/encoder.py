@@ -182,7 +182,7 @@ def _require_learnable(basis: str, features: Sequence[str]) -> None:
     """Require a basis and features with which basis points can be learned.
 
     Raises:
-        ConfigError: they cannot.
+        ConfigError: the basis points cannot be learned.
     """
     if basis == "grid":
         raise ConfigError(

@@ -1,9 +1,9 @@
 """Choice of basis points for a set of clouds: the points whose distances together say most about all distances.
 
 The distances of a set of clouds from many candidate points are the columns of a matrix with one row for each cloud.
-QR factorisation with column pivoting (Businger & Golub 1965) chooses columns one after the other: always the column of
-which the columns chosen before explain least, by its residual in a linear least-squares fit. The same method places
-sensors (Manohar, Brunton, Kutz & Brunton 2018). It reads no target.
+QR factorisation with column pivoting (Businger & Golub 1965) chooses columns one after the other: always the column
+with the largest residual in a linear least-squares fit to the columns chosen before. The same method places sensors
+(Manohar, Brunton, Kutz & Brunton 2018). It reads no target.
 """
 
 from collections.abc import Iterable, Iterator

@@ -187,6 +187,7 @@ def merge_sampling(parts: Float[Tensor, "parts 5"]) -> Float[Tensor, "5"]:
 def merge_moments(parts: Float[Tensor, "parts 3"]) -> Float[Tensor, "3"]:
     """Return the moments of all samples, from the moments of disjoint parts (Chan, Golub & LeVeque 1983, eq. 2.1).
 
+    The moments are those that `compute_moments` returns.
     Unlike a sum of squares, this method stays exact if the mean is much larger than the deviation.
     """
     parts = parts[parts[:, 0] > 0]

@@ -234,7 +234,7 @@ def split_in_halves(batches: Sequence[Batch]) -> tuple[list[Batch], list[Batch]]
 
 
 def coverage_remark(count: int, miscoverage: float) -> str:
-    """Return a remark on how far the coverage may deviate from the stated one, and how many scores would suffice.
+    """Return a remark on how far the coverage may deviate from the stated one, and how many scores keep it within NEAR.
 
     The threshold is fitted to n = `count` scores of the validation split. The coverage of the sets with this threshold
     is itself random: Beta(k, n + 1 - k) for distinct scores, with k = ⌈(n + 1)(1 - α)⌉ for α = `miscoverage` (Vovk

@@ -35,7 +35,7 @@ class Temperature(Uncertainty):
     end as T decreases, T stops at the bound, and the log says so.
 
     With `prior`, log T has a normal prior density around 0, and T has the highest posterior density. On a separable
-    split of few samples, the likelihood rises by little as T decreases, because the model has hardly lost anything at
+    split of few samples, the likelihood rises by little as T decreases, because it is already close to its maximum at
     T = 1. The prior then keeps T near 1; many samples, or wrong predictions, outweigh it.
 
     Args:
