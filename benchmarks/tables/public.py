@@ -174,8 +174,8 @@ def page() -> None:
         )
     lines += [
         "",
-        "For classes, the recommended start fits a temperature to training rows that its models left out. A prior keeps "
-        "the temperature near 1 where the classes of few rows are perfectly separable.",
+        "For classes, the recommended start fits a temperature to training rows that its models left out. A prior "
+        "keeps the temperature near 1 where the classes of few rows are perfectly separable.",
     ]
     command = "Command: the two lines at the top of `benchmarks/tables/public.py`."
     publish(__file__, "\n".join([*lines, "", f"{machine('torch', 'scikit-learn')} {command}", ""]))
