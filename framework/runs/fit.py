@@ -149,7 +149,7 @@ def _train_itself(session: Session, run: Run, wrapper: SelfTraining) -> float:
             loaded = [{**batch, "input": front.features(batch["input"])} for batch in loaded]
     inputs, target = (torch.cat([batch[name] for batch in loaded]) for name in ("input", "target"))
     settings = session.settings
-    batches = settings.trainer.get("limit_train_batches")  # set in a short test run (`debug=fast`) only
+    batches = settings.trainer.get("limit_train_batches")  # set by `debug=fast`, for example
     most_steps = batches * settings.trainer.get("max_epochs", 1) if isinstance(batches, int) else None
     loss = wrapper.train_models(
         inputs, target, seed=settings.seed, batch_size=settings.batch_size, most_steps=most_steps

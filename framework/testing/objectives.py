@@ -29,10 +29,10 @@ STEPS = (1e-5, 1e-6, 1e-7, 1e-8)
 """Step lengths of central differences."""
 MANY = 130
 """Number of samples of a large batch."""
-MEMBERS = "penalties of members, (batch, member), are combined by framework.model.independent_penalty"
+MEMBERS = "combine the penalties of members, (batch, member), by framework.model.independent_penalty"
 """Advice for an objective with wrong gradients of members."""
 SECOND_PASS = (
-    "a further pass through the predictor stands in a block of "
+    "put a further pass through the predictor into a block of "
     "framework.calibration.module_flags.set_flag(predictor, BATCH_NORM, 'track_running_stats', False)"
 )
 """Advice for an objective that changes the running moments of batch norm."""
