@@ -1059,6 +1059,23 @@ def test_a_store_that_lost_the_run_gets_it_anew(
     assert "the whole run is sent again" in caplog.text
 
 
+@pytest.mark.parametrize("tags", [{}, {"framework.key": "another"}])
+def test_a_run_of_another_program_or_folder_is_left_alone(folder: Path, tags: dict[str, str]) -> None:
+    """The id in run.json may come from an untrusted source, and name any run of the user's store."""
+    tracker = open_tracker(folder)
+    log(tracker, range(3))
+    tracker.leave_open()
+    store = client(folder)
+    run = store.create_run(store.create_experiment("of the user"), tags=tags)
+    again = open_tracker(folder, run_id=run.info.run_id)
+    log(again, range(3, 5))
+    again.close("FINISHED")
+    assert again.run_id not in (None, run.info.run_id)
+    left = store.get_run(run.info.run_id)
+    assert (left.info.status, left.data.metrics, left.data.params) == ("RUNNING", {}, {})
+    assert left.data.tags == run.data.tags
+
+
 def test_a_store_deleted_while_the_run_goes_on_is_made_again_with_everything(
     folder: Path, empty_store: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

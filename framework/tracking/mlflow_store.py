@@ -181,15 +181,15 @@ class MlflowStore(Store):
         if info.run_id is not None:
             try:
                 run = self._client.get_run(info.run_id)
-                # the id in a file may belong to another run of the user
-                if run.data.tags.get(_KEY, info.key) == info.key:
+                # the id in a file may belong to another run of the user, also of another program
+                if run.data.tags.get(_KEY) == info.key:
                     return run
             except MlflowException as error:
                 if error.error_code != "RESOURCE_DOES_NOT_EXIST":
                     raise
             uri = without_password(info.uri)
             _log.warning(
-                "The store %s contains no run %s, so the whole run is sent again.",
+                "The store %s contains no run %s of this folder, so the whole run is sent again.",
                 shorten(uri),
                 shorten(info.run_id),
             )
