@@ -108,6 +108,7 @@ OWN_FILES = {
     "framework/modes/plugins.py": "the package's own modules",
     "framework/runs/repository.py": "the copy of an index that it has made",
     "framework/scaffold/data/example.py": "an example for plugins; mode=check damages its files",
+    "framework/sweeps/ray_guard.py": "/proc",
     "framework/tracking/watch.py": "/proc",
     "plugins/data/cest/data.py": "the cache, fitted again where it cannot be read",
     "plugins/density_head/von_mises/coefficients.py": "the package's table of coefficients",

@@ -579,7 +579,7 @@ def _keep_training_rows(split: Int[np.ndarray, "row"], labels: np.ndarray) -> tu
 
 def _most_classes(rows: int) -> float:
     """Return the largest number of different labels that are accepted as classes in a table of `rows` rows."""
-    return max(MANY_LABELS, rows / 2)
+    return max(float(MANY_LABELS), rows / 2)
 
 
 def _constant_targets(names: Sequence[str], training_values: np.ndarray) -> tuple[str, ...]:
