@@ -1,7 +1,10 @@
 """Tests of the reader of CSV columns, and of its messages, which name line and column."""
 
+import bz2
 import gzip
+import lzma
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +67,17 @@ def test_an_empty_cell_in_a_table_of_one_column_is_a_row(tmp_path: Path) -> None
 def test_wrong_files_are_refused(tmp_path: Path, content: str | bytes, message: str) -> None:
     with pytest.raises(DataError, match=message):
         read_columns(written(tmp_path, content))
+
+
+@pytest.mark.parametrize("packed", [bz2.compress, lambda content: bz2.compress(content, 1), lzma.compress])
+def test_packed_files_are_named(tmp_path: Path, packed: Callable[[bytes], bytes]) -> None:
+    with pytest.raises(DataError, match=r"the file is compressed with (bzip2|xz), but plain text is required"):
+        read_columns(written(tmp_path, packed(b"a,b\n1,2")))
+
+
+@pytest.mark.parametrize("name", ["PAR1", "BZh", "BZh9", "PK", "HDF", "7zXZ"])
+def test_a_column_named_like_the_beginning_of_a_packed_file_is_read(tmp_path: Path, name: str) -> None:
+    assert [*read_columns(written(tmp_path, f"{name},b\n1,2\n")).cells] == [name, "b"]
 
 
 def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:

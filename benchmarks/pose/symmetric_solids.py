@@ -367,7 +367,7 @@ ran on the machine. Every method has the same network and
 the same 8 epochs (2,500 steps); Murphy et al. 2021 train for 100,000 steps. The mixture has three components for each
 of the 24 equivalent rotations of a cube. 24 components are not enough: while a cube turns until it looks the same
 again, its equivalent rotations change places, so that no 24 continuous functions of the image can follow them. The
-number was chosen on validation images of a cube ([mixture](../../plugins/density_head/mixture/README.md)).
+number was chosen in short trials on validation images of a cube, which no command repeats.
 
 ![Distance from the exact density against milliseconds per image](symmetric_solids_cost.png)
 

@@ -548,14 +548,14 @@ def _require_small_error(model: Exporting, name: str, trials: Sequence[Trial], l
     """
     exact = [(trial.double() or {}).get(name) for trial in trials]
     difference = max(trial.difference(name) for trial in trials)
-    found = (
+    clause = (
         f"The exported network differs from it by {difference:.1e} in the parameter {name} for {label} inputs"
     )
     shares = f"These are shares of the largest {name} of an input, or of 1."
     if any(values is None for values in exact):
         raise _refusal(
             model,
-            f"{found}, and at most {PARITY:g} is allowed for a model that cannot compute in float64. {shares}",
+            f"{clause}, and at most {PARITY:g} is allowed for a model that cannot compute in float64. {shares}",
         )
     pairs = [(trial, values) for trial, values in zip(trials, exact, strict=True) if values is not None]
     error = max(_difference(trial.outputs[name], values) for trial, values in pairs)
@@ -563,7 +563,7 @@ def _require_small_error(model: Exporting, name: str, trials: Sequence[Trial], l
     if not error <= ROUNDING * own_error < math.inf:
         raise _refusal(
             model,
-            f"{found}. Compared with the model in float64, its error is {error:.1e}, but at most {ROUNDING:g} times "
+            f"{clause}. Compared with the model in float64, its error is {error:.1e}, but at most {ROUNDING:g} times "
             f"the model's own rounding error of {own_error:.1e} is allowed. {shares}",
         )
 

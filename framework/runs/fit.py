@@ -51,8 +51,7 @@ from framework.uncertainty import SelfTraining, outermost, self_training
 FEW_STEPS = 200
 """Number of steps below which a training on a user's data ends with a note.
 
-20 epochs of one batch left the recommended classifier of images at chance on 63 drawings, and 240 steps in
-smaller batches gave the accuracy of the nearest neighbour.
+The recommended start for images has 20 epochs, which are only 20 steps if all images fit into one batch.
 """
 PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": PyTorchProfiler}
 """Profilers of Lightning whose report the run folder receives, by the value of `trainer.profiler`."""

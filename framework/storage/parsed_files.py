@@ -111,9 +111,9 @@ class ParsedFiles(Generic[Content]):
 def _stamp(file: Path) -> Stamp | None:
     """Return the stamp of a regular file, or None if the path is anything else."""
     try:
-        found = os.stat(file)  # noqa: PTH116 - called for thousands of files
+        status = os.stat(file)  # noqa: PTH116 - called for thousands of files
     except OSError:
         return None
-    if not stat.S_ISREG(found.st_mode):
+    if not stat.S_ISREG(status.st_mode):
         return None
-    return Stamp(found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino)
+    return Stamp(status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino)

@@ -28,13 +28,16 @@ PACKED = {
     b"PK\x03\x04": "an archive, such as an Excel workbook (.xlsx)",
     b"\xd0\xcf\x11\xe0": "a file of an old Office program, such as an Excel workbook (.xls)",
     b"\x1f\x8b": "compressed with gzip",
-    b"BZh": "compressed with bzip2",
+    **{b"BZh%d1AY&SY" % level: "compressed with bzip2" for level in range(1, 10)},
     b"\xfd7zXZ": "compressed with xz",
     b"\x28\xb5\x2f\xfd": "compressed with zstd",
-    b"PAR1": "a Parquet table",
+    b"PAR1\x15": "a Parquet table",
     b"\x89HDF": "an HDF5 file",
 }
-"""First bytes of files that users give where text is required, and what such a file is."""
+"""First bytes of files that users give where text is required, and what such a file is.
+
+They are so long that no text begins with them: a table may begin with a column PAR1.
+"""
 LOOKED_AT = 64
 """Number of leading bytes that are searched for UTF-16 without a byte-order mark, in which every second byte is 0."""
 MINUS = str.maketrans(

@@ -169,7 +169,7 @@ def test_the_teacher_is_neither_trained_nor_stored():
 
 
 class Sample:
-    """What `check_data` reads of a data set."""
+    """Attributes of a data set that `check_data` reads."""
 
     def __init__(self, **changed):
         self.target, self.input_shape, self.columns = CLASSES, (6,), ()
