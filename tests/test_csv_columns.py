@@ -71,7 +71,9 @@ def test_wrong_files_are_refused(tmp_path: Path, content: str | bytes, message: 
 
 @pytest.mark.parametrize("packed", [bz2.compress, lambda content: bz2.compress(content, 1), lzma.compress])
 def test_packed_files_are_named(tmp_path: Path, packed: Callable[[bytes], bytes]) -> None:
-    with pytest.raises(DataError, match=r"the file is compressed with (bzip2|xz), but plain text is required"):
+    with pytest.raises(
+        DataError, match=r"the file is compressed with (bzip2|xz), but plain text is required"
+    ):
         read_columns(written(tmp_path, packed(b"a,b\n1,2")))
 
 

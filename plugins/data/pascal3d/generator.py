@@ -4,6 +4,7 @@ The same class, number of images, seed and renderer give the same bytes. Each im
 order in which threads or processes draw the images does not matter.
 """
 
+import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from threading import Lock
@@ -17,14 +18,18 @@ from framework.renderer import Renderer
 from framework.storage.generated import draw_all, ensure_generated
 from plugins.data.pascal3d.families import FAMILIES
 from plugins.data.pascal3d.layout import VOC_LISTS
-from plugins.data.pascal3d.matlab_writer import Struct, file_of
 from plugins.data.pascal3d.scene import AnnotatedObject, Shot, shoot
 
 VERSION = 1
 """Version of the generator; increase it if the output changes, so that a new folder is written."""
 SHARES = {"imagenet_train": 0.4, "imagenet_val": 0.2, "pascal_train": 0.2, "pascal_val": 0.2}
-DESCRIPTION = b"MATLAB 5.0 MAT-file, synthetic annotation"
-"""Text at the beginning of the annotation files; it holds no date, so that the same annotation gives the same bytes."""
+SAVING = Lock()
+"""Lock for SciPy's writers of MATLAB files.
+
+All writers share one variable for the sizes that they write, so two writers at the same time would mix them up.
+"""
+# SciPy's own header holds the date, which would change the bytes of the file
+HEADER = b"MATLAB 5.0 MAT-file, synthetic annotation".ljust(116)
 
 
 def generate_class(parent: Path, category: str, images: int, seed: int, renderer: Renderer) -> Path:
@@ -101,33 +106,47 @@ def _save(part: Path, folder: str, name: str, shot: Shot) -> None:
         "folder": folder,
         "filename": image.name,
         "size": {"width": float(width), "height": float(height), "depth": float(depth)},
-        "imgsize": (float(width), float(height), float(depth)),
+        "imgsize": np.array([[width, height, depth]], dtype=np.float64),
         "database": "synthetic",
-        "objects": [_object(annotated, shot.blur) for annotated in shot.objects],
+        "objects": _objects(shot),
     }
-    (part / "Annotations" / folder / f"{name}.mat").write_bytes(file_of("record", record, DESCRIPTION))
+    from scipy.io import (
+        savemat,  # this import takes a quarter of a second, and reading the data does not need it
+    )
+
+    content = io.BytesIO()
+    with SAVING:
+        savemat(content, {"record": record}, do_compression=True)
+    (part / "Annotations" / folder / f"{name}.mat").write_bytes(HEADER + content.getvalue()[len(HEADER) :])
 
 
-def _object(annotated: AnnotatedObject, blur: float) -> Struct:
-    """Return an entry of the struct array `record.objects` of an annotation file.
+def _objects(shot: Shot) -> np.ndarray:
+    """Return the struct array `record.objects` of an annotation file.
 
     It has all fields of the official files, and in addition the fields `symmetry` and `blur`.
     """
-    return {
-        "class": annotated.category,
-        "view": "",
-        "truncated": float(annotated.truncated),
-        "occluded": float(annotated.occluded),
-        "difficult": float(annotated.difficult),
-        "bbox": [float(edge + 1) for edge in annotated.box],  # the official boxes count from 1
-        "cad_index": 1.0,
-        "viewpoint": _viewpoint(annotated),
-        "symmetry": float(annotated.symmetry),
-        "blur": float(blur),
-    }
+    entries = [
+        {
+            "class": annotated.category,
+            "view": "",
+            "truncated": float(annotated.truncated),
+            "occluded": float(annotated.occluded),
+            "difficult": float(annotated.difficult),
+            "bbox": np.array([annotated.box], dtype=np.float64) + 1,  # the official boxes count from 1
+            "cad_index": 1.0,
+            "viewpoint": _viewpoint(annotated),
+            "symmetry": float(annotated.symmetry),
+            "blur": float(shot.blur),
+        }
+        for annotated in shot.objects
+    ]
+    array = np.empty((1, len(entries)), dtype=[(name, object) for name in entries[0]])
+    for index, entry in enumerate(entries):
+        array[0, index] = tuple(entry.values())
+    return array
 
 
-def _viewpoint(annotated: AnnotatedObject) -> Struct:
+def _viewpoint(annotated: AnnotatedObject) -> dict[str, float]:
     """Return the fields of the official struct `viewpoint`.
 
     The focal length in pixels is `focal` × `viewport`; (`px`, `py`) is the principal point, pixels counted from 1.

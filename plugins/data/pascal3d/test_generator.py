@@ -3,14 +3,13 @@
 import json
 import math
 import os
+import sys
 from collections.abc import Collection, Mapping
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import scipy.io
 import torch
 
 from framework.configuration import schema
@@ -20,8 +19,9 @@ from framework.storage import generated
 from plugins.data.pascal3d import generator
 from plugins.data.pascal3d.families import FAMILIES
 from plugins.data.pascal3d.layout import CLASSES
-from plugins.data.pascal3d.matlab_writer import file_of
 from plugins.data.pascal3d.scene import (
+    AnnotatedObject,
+    Shot,
     View,
     camera_of,
     crop_camera,
@@ -327,26 +327,34 @@ def test_images_hold_objects_of_every_kind_that_the_protocol_leaves_out(renderer
         assert annotated.symmetry == FAMILIES[annotated.category].symmetry
 
 
-def test_the_writer_writes_the_bytes_of_scipy() -> None:
-    """Texts and names of 0 to 40 letters, also beyond ASCII, numbers, and structs of one and of several entries."""
-    random = np.random.default_rng(0)
-    for count in range(1, 6):
-        texts = ["", "car", "boat", "bottle", "diningtable " * 3, "Zürich"]
-        entries: list[dict[str, Any]] = [
-            {
-                "class": str(random.choice(texts)),
-                "a_long_name_of_a_field": float(random.normal()),
-                "bbox": random.normal(size=4).tolist(),
-                "viewpoint": {"azimuth": float("nan"), "theta": float("inf")},
-            }
-            for _ in range(count)
-        ]
-        record = {"filename": texts[count], "objects": entries, "size": {"width": float(count)}}
-        array = np.empty((1, count), dtype=[(name, object) for name in entries[0]])
-        for index, entry in enumerate(entries):
-            array[0, index] = tuple(entry.values())
-        stream = BytesIO()
-        scipy.io.savemat(stream, {"record": {**record, "objects": array}}, do_compression=True)
-        expected = stream.getvalue()
-        assert file_of("record", record, b"any text").startswith(b"any text ")
-        assert file_of("record", record, expected[:116]) == expected
+def test_annotations_written_by_threads_equal_those_written_one_after_the_other(
+    tmp_path: Path,
+) -> None:
+    """Check with threads that switch every microsecond, because SciPy's writers share a variable."""
+    pixels = np.zeros((8, 9, 3), np.uint8)
+    view = View(10.0, 20.0, 0.0, 3.0, 100.0, (4.0, 4.0))
+    objects = [
+        AnnotatedObject(name, view, (1, 2, 3, 4), False, False, False, True, 0)
+        for name in ("car", "aeroplane", "tv")
+    ]
+    for folder in ("alone", "together"):
+        for kind in ("Annotations", "Images"):
+            (tmp_path / folder / kind / "car_pascal").mkdir(parents=True)
+
+    def save(folder: str, number: int) -> None:
+        shot = Shot(pixels, objects[: 1 + number % 3], 0.0)
+        generator._save(tmp_path / folder, "car_pascal", f"{number:03d}", shot)
+
+    for number in range(240):
+        save("alone", number)
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        generated.draw_all(240, lambda number: save("together", number), "annotations")
+    finally:
+        sys.setswitchinterval(before)
+    alone, together = (
+        sorted((tmp_path / folder / "Annotations").rglob("*.mat")) for folder in ("alone", "together")
+    )
+    assert len(alone) == 240
+    assert [file.read_bytes() for file in alone] == [file.read_bytes() for file in together]
