@@ -76,15 +76,19 @@ class SlurmCluster:
         plugins = next(sbin.parent.glob("lib/*/slurm*/auth_munge.so")).parent
         config = CONFIG.format(folder=folder, host=host, user=user, plugins=plugins, ports=_free_ports(3))
         (folder / "slurm.conf").write_text(config)
-        self._run(
-            *("munged", "--force", f"--key-file={key}", f"--socket={folder}/munge.socket"),
-            *(f"--pid-file={folder}/munge.pid", f"--log-file={folder}/munge.log"),
-            f"--seed-file={folder}/munge.seed",
-        )
-        self._run("slurmctld")
-        self._stepd = shutil.which("slurmstepd") or str(next(sbin.glob("slurmstepd*")))
-        for node in ("n1", "n2"):
-            self.start_node(node)
+        try:
+            self._run(
+                *("munged", "--force", f"--key-file={key}", f"--socket={folder}/munge.socket"),
+                *(f"--pid-file={folder}/munge.pid", f"--log-file={folder}/munge.log"),
+                f"--seed-file={folder}/munge.seed",
+            )
+            self._run("slurmctld")
+            self._stepd = shutil.which("slurmstepd") or str(next(sbin.glob("slurmstepd*")))
+            for node in ("n1", "n2"):
+                self.start_node(node)
+        except BaseException:  # the test was stopped, or a daemon does not start
+            self.close()
+            raise
 
     def start_node(self, node: str) -> None:
         """Start the daemon of a node, and wait until jobs can run there."""

@@ -1,15 +1,22 @@
 """The counts of the soak test, and its short form: two kills of jobs."""
 
 import json
+import os
 import random
 import re
+import signal
+import subprocess
 import sys
+import tempfile
+import time
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
-from tests.fuzz.kills import Tally, killed, start
+from tests.fuzz.kills import ROOT, Tally, killed, start
+from tests.slurm_cluster import missing_programs
 from tests.soak.__main__ import RECORD, Counts, State, read_tests
 from tests.soak.kinds import all_kinds
 
@@ -37,6 +44,35 @@ def test_counts_add_up_and_survive_their_file(tmp_path: Path) -> None:
     other.add(state.counts())
     assert other.tallies == {"a": {9: Tally(3, 2, float("inf"), 3, 2)}, "b": {15: Tally(4)}}
     assert (other.events, other.faults, other.total) == ({"e": [1, 2, 0]}, ["a fault"], 9)
+
+
+@pytest.mark.skipif(bool(missing_programs()), reason="SLURM and MUNGE are not installed")
+def test_a_soak_test_that_is_terminated_ends_its_cluster(tmp_path: Path) -> None:
+    with tempfile.TemporaryDirectory(prefix="soak") as folder:  # a short path, because it holds sockets
+        words = [
+            sys.executable,
+            "-m",
+            "tests.soak",
+            "200",
+            "--folder",
+            str(tmp_path / "soak"),
+            "--only",
+            "SLURM",
+        ]
+        soak = subprocess.Popen(words, cwd=ROOT, env={**os.environ, "TMPDIR": folder})
+        deadline = time.monotonic() + 60
+        names = ("munge", "slurmctld", "slurmd.n1", "slurmd.n2")
+        while len(pids := _pids(Path(folder), names)) < len(names) or not (tmp_path / "soak").exists():
+            assert soak.poll() is None and time.monotonic() < deadline
+            time.sleep(0.05)
+        soak.terminate()
+        assert soak.wait(timeout=60) == 128 + signal.SIGTERM
+        assert [pid for pid in pids if Path(f"/proc/{pid}").exists()] == []
+
+
+def _pids(folder: Path, names: Sequence[str]) -> list[int]:
+    paths = [path for name in names for path in folder.glob(f"*/{name}.pid")]
+    return [int(text) for path in paths if (text := path.read_text().strip())]
 
 
 @pytest.mark.slow

@@ -4,10 +4,10 @@
 
 The test kills a command up to eight times, lets it finish, and compares what it has written, to the last bit, with the
 same command without a kill (`tests.fuzz.kills`). SLURM is included if its programs are on PATH. The folder keeps the
-counts, so that the command can be stopped and repeated. Each kind of kill has a share of all kills, and
-the kind that has made the smallest part of its share comes next. benchmarks/framework/soak.json holds the kills of all
-tests so far, which count as well. The script writes soak.json and soak.md there: when all kills are made (unless --only
-chose some kinds), or at its end if --page is given.
+counts, so that the command can be stopped (SIGINT, SIGTERM) and repeated. Each kind of kill has a share of all kills,
+and the kind that has made the smallest part of its share comes next. benchmarks/framework/soak.json holds the kills of
+all tests so far, which count as well. The script writes soak.json and soak.md there: when all kills are made (unless
+--only chose some kinds), or at its end if --page is given.
 """
 
 import argparse
@@ -24,7 +24,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -275,7 +275,7 @@ class Soak:
 
 
 def end_all(folder: Path) -> None:
-    """Kill the processes of commands that work in a folder, after one of them has failed."""
+    """Kill the processes of commands that work in a folder, after one of them has failed or the test was stopped."""
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):  # the process has ended
             ours = f"{MARK}=".encode() in (process / "environ").read_bytes()
@@ -387,9 +387,11 @@ def main() -> None:
     arguments.add_argument("--page", action="store_true", help="write the page before all kills are made")
     options = arguments.parse_args()
     deadline = time.monotonic() + 60 * options.minutes
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     os.environ.setdefault("FRAMEWORK_CACHE", str(options.folder.absolute() / "cache"))
     options.folder.mkdir(parents=True, exist_ok=True)
-    with hold_lock(options.folder / ".lock"), slurm_cluster() as slurm:
+    with hold_lock(options.folder / ".lock"), slurm_cluster() as slurm, ExitStack() as at_the_end:
+        at_the_end.callback(end_all, options.folder.absolute())
         soak = Soak(options.folder.absolute(), options.count)
         kinds = all_kinds(soak.folder / "inputs", {} if slurm is None else slurm.environment)
         chosen = [
