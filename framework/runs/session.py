@@ -284,7 +284,7 @@ def _require_whole_training(predictor: Predictor, config: Config) -> None:
     if self_training(predictor) is not None or not learns(predictor):
         raise ConfigError(
             f"{name} collects weights after each epoch of a training by gradient, but this model is trained in another "
-            "way. Leave one of the two out."
+            "way. Leave this wrapper out, or choose a model that is trained by gradient."
         )
     if trainer.get("keep") != "last" or trainer.get("patience") or (trainer.get("max_epochs") or -1) < 1:
         raise ConfigError(
@@ -404,8 +404,9 @@ def rehearse(session: Session) -> None:
     """Try the steps that follow training with a few samples, so that errors in these steps appear before training.
 
     The function checks a few targets, lets the untrained model predict two samples, updates every metric with these
-    predictions, and calibrates a copy of the model. If the model cannot predict before it is fitted, the function only
-    checks the targets, and that the true images exist.
+    predictions, and calibrates a copy of the model. A model that is fitted in one step cannot predict before the fit.
+    For such a model, the function only checks the targets, and that the batches have the images that metrics compare
+    with predicted images.
 
     Raises:
         UserError: The data, a metric or an uncertainty wrapper fails with these samples.

@@ -128,7 +128,7 @@ class AverageWeights(WeightAveraging):
         if collects is not None:
             raise ConfigError(
                 f"trainer.callbacks=[weight_averaging] averages all numbers of the model, but "
-                f"{type(collects).__name__} collects weights itself. Leave one of the two out."
+                f"{type(collects).__name__} collects weights itself. Leave this callback or this wrapper out."
             )
         augment = pl_module.augment
         pl_module.augment = _unchanged  # a method of the data set, which would be copied with the model

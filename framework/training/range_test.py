@@ -79,8 +79,8 @@ class RangeTestResult:
         )
         return (
             f"learning rate: {self.learning_rate:.2g}, where the loss of a range test over {len(self.rates)} steps "
-            f"falls fastest, by {-self.slope:.2g} ± {self.slope_error:.1g} nats per decade of the rate. It is lowest "
-            f"near {self.lowest:.2g}{ended}."
+            f"falls fastest, by {-self.slope:.2g} ± {self.slope_error:.1g} nats per decade of the rate. The loss is "
+            f"lowest near {self.lowest:.2g}{ended}."
         )
 
     def save(self, path: Path) -> None:

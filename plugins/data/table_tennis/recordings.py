@@ -131,9 +131,9 @@ def _from_matlab(file: Path) -> list[Flight]:
         tables = [_join(time, ball) for time, ball in pairs]
     else:
         raise DataError(
-            f"{file} holds {shorten(', '.join(variables)) or 'nothing'}, but ballTrain with a field data, or time "
-            "and ball, are expected, as in the files of the WAM laboratory. Give such a file, or write each flight as "
-            "CSV with the columns t, x, y, z."
+            f"{file} holds {shorten(', '.join(variables)) or 'nothing'}, but the variable `ballTrain` with a "
+            "field `data`, or the variables `time` and `ball`, are expected, as in the files of the WAM laboratory. "
+            "Give such a file, or write each flight as CSV with the columns t, x, y, z."
         )
     for number, table in enumerate(tables):
         if table.ndim != 2 or table.shape[1] != 4:

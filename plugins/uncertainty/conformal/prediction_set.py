@@ -75,7 +75,10 @@ class PredictionSet(Unchanged, ValueSet):
         self.threshold = threshold
         self.score: Score = score
         if score == "quantiles" and stated_probability is None:
-            raise ConfigError("The score quantiles needs the stated probability of the interval. Pass one.")
+            raise ConfigError(
+                "score='quantiles' needs the probability of the central interval, but stated_probability is None. Pass "
+                "a number between 0 and 1."
+            )
         if score == "quantiles" and (
             density.has_enumerate_support
             or tuple(density.event_shape) != (1,)
