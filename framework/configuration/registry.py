@@ -54,7 +54,10 @@ def unusable_names(group: str) -> dict[str, str]:
 
 @cache
 def package_name(package: Any) -> str | None:
-    """Return the name of an installed package (an `Entry.dist`), cached, because Python parses it at each access."""
+    """Return the name of an installed package (an `Entry.dist`).
+
+    The name is cached, because Python parses the metadata of the package at each access.
+    """
     return package.name
 
 

@@ -1,6 +1,7 @@
 """mode=predict: write point predictions and uncertainties for a user's own files or the test split to a CSV file.
 
-Predicted images, and maps if the data set draws them, are written as files beside the CSV file.
+Predicted images are written as files beside the CSV file. So are maps of the predictions, if the data set draws them
+(`framework.data.Mapped`).
 """
 
 import csv

@@ -93,7 +93,7 @@ def launched_processes() -> Launched | None:
 
 
 def count_devices(trainer: Mapping[str, Any]) -> int:
-    """Return the number of devices of a node in the trainer's settings; a node has one process for each device."""
+    """Return the number of devices that the trainer uses on each node; a node has one process for each device."""
     devices = trainer.get("devices", 1)
     if isinstance(devices, list):
         return len(devices)

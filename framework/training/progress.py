@@ -52,7 +52,7 @@ class Progress(BatchCallback):
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Advance the bar or, after `seconds`, write a line."""
+        """Advance the bar. Without a bar, write a line if the last line was written more than `seconds` ago."""
         assert isinstance(pl_module, Training)
         self._total += pl_module.last_loss
         self._steps += 1

@@ -239,9 +239,8 @@ def claims_text(rows: list[dict[str, object]]) -> str:
     counts = ", ".join(f"{name} at {best.count(name)} of {len(best)} lengths" for name in sorted(set(best)))
     return (
         f"{markdown(compared, {'length': 'N', **headings})}\n\n"
-        "The list shows for each arrangement of basis points at which lengths N its reconstruction error is less "
-        f"than half of that of the occupancy grid: {'; '.join(parts)}. The arrangement with the smallest error is "
-        f"{counts}."
+        "An arrangement of basis points has less than half of the reconstruction error of the occupancy grid at these "
+        f"lengths N: {'; '.join(parts)}. The arrangement with the smallest error is {counts}."
     )
 
 

@@ -76,7 +76,7 @@ class PlanePoints(Data):
 
 
 def split_of(inputs: Float32[Tensor, "size 2"], label: Int[np.ndarray, "size"], **more: Tensor) -> Fields:
-    """Return a split that consists of points, their labels and further fields; all points are in group 0."""
+    """Return a split that consists of points, their labels and further fields; "group" is 0 for all points."""
     return Fields(
         input=inputs,
         target=torch.from_numpy(label),

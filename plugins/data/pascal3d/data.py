@@ -113,8 +113,8 @@ class Drawing:
 class Pascal3D(Data):
     """Rigid objects in photographs and their azimuth, elevation and tilt; generated if no root is given.
 
-    In addition to the fields that `framework.data.Batch` requires, a batch holds "symmetry" (1 for real data) and, for
-    generated data, "blur" (float32, the standard deviation of the blur, pixels of the input).
+    A batch holds the fields that `framework.data.Batch` requires, and "symmetry" (see there), 1 for real objects. For
+    generated data it also holds "blur", the standard deviation of the blur (float32, pixels of the input).
 
     Args:
         root: The unpacked PASCAL3D+_release1.1; None to generate images in the same layout.

@@ -1,4 +1,4 @@
-"""The conditional variational autoencoder: its networks, its two lower bounds, and the density head."""
+"""Conditional variational autoencoder: its networks, two lower bounds of its log-likelihood, and the density head."""
 
 import math
 from collections.abc import Callable

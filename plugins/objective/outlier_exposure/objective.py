@@ -1,4 +1,4 @@
-"""Outlier exposure: a penalty on predicted densities of outliers that differ from a uniform density."""
+"""Outlier exposure: a penalty on the difference between predicted densities of outliers and a uniform density."""
 
 from typing import Annotated, Literal
 
@@ -20,7 +20,7 @@ from plugins.objective.outlier_exposure.divergence import from_uniform, to_ignor
 
 
 class OutlierExposure(Objective):
-    """A penalty on predicted densities p of outliers that differ from a uniform density u (thesis eq. 2.21).
+    """A penalty on the divergence of predicted densities p of outliers from a uniform density u (thesis eq. 2.21).
 
     The penalty is the weight times the mean over outliers of a divergence, nats, which is 0 for p = u. For classes,
     "entropy" is KL(p ‖ u) = log K - H(p), which is eq. 2.21 plus a constant without gradient. "cross_entropy" is
