@@ -161,16 +161,14 @@ def read_camera(file: Path) -> Camera:
     if not torch.equal(matrix, pinhole) or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
         raise DataError(
             f"{file}: the camera matrix K is {matrix.tolist()}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in "
-            "pixels "
-            "with fx and fy above 0. Skew and distortion are not supported: undistort the image first."
+            "pixels with fx and fy above 0. Skew and distortion are not supported: undistort the image first."
         )
     error = float((rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max())
     determinant = float(torch.linalg.det(rotation))
     if error > ROTATION_ERROR or determinant < 0:
         raise DataError(
             f"{file}: the matrix R is not a rotation (R times its transpose differs from the identity by {error:.2g}, "
-            "the "
-            f"determinant of R is {determinant:.4g}). R must rotate from world to camera axes (x right, y down, z "
+            f"the determinant of R is {determinant:.4g}). R must rotate from world to camera axes (x right, y down, z "
             "forward). Check that R is not transposed or scaled."
         )
     focal, principal = (float(matrix[0, 0]), float(matrix[1, 1])), (float(matrix[0, 2]), float(matrix[1, 2]))

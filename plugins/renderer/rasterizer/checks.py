@@ -147,8 +147,7 @@ def check_scene(
         if gradient == "soft" and "color" in channels:
             raise ValueError(
                 "gradient=soft draws only colours of vertices, but the scene has a texture. Choose gradient=boundary, "
-                "or "
-                "remove the texture."
+                "or remove the texture."
             )
         for name, part in texture_tensors(scene.texture).items():
             check_device(name, part)

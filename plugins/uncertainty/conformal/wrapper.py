@@ -48,7 +48,7 @@ class Conformal(Uncertainty):
     1 - α, and of at most 1 - α + 1/(n + 1) if no two of the n scores are equal. This probability is an average over
     targets and validation splits, for any model, however wrong (Vovk, Gammerman & Shafer 2005, §4.1). The bounds do not
     hold for each input separately. Use this wrapper as the outermost one: a wrapper around it keeps the densities and
-    drops the sets.
+    drops the sets, except for `feature_score`, which keeps both.
 
     The wrapped model is calibrated on a random half of the validation split, which is always the same half. The
     threshold is fitted to the other half, because scores of samples to which a temperature was fitted give no
