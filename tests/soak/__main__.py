@@ -269,7 +269,7 @@ class Soak:
                 end_all(self.folder)
                 faults = [f"{type(error).__name__}: {error}"]
                 self._note(name, -1, faults, self.folder)
-            sys.stdout.write(f"{self.counts.total} kills; {name}: {faults or 'equal'}\n")
+            sys.stdout.write(f"{self.counts.total} kills; {name}: {faults[:5] or 'equal'}\n")
             sys.stdout.flush()
         return False
 

@@ -6,6 +6,7 @@ import socket
 import sqlite3
 import sys
 import time
+import urllib.request
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import closing, suppress
@@ -177,15 +178,25 @@ def _missing(run: Path, database: Path) -> list[str]:
 
 
 def _serve(folder: Path, port: int, environment: Mapping[str, str]) -> Command:
-    """Start the server of the store, and wait until it accepts connections."""
+    """Start the server of the store, and wait until it has answered a request from its database.
+
+    The server creates the tables of a new database at the first request. MLflow cannot repair an SQLite database if it
+    is killed while it creates them, so the kills come later.
+    """
     server = Command([sys.executable, "-c", SERVER, str(port)], folder, **environment)
     deadline = time.monotonic() + 120
     while True:
-        with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1):
+        with suppress(OSError), urllib.request.urlopen(_experiments(port), timeout=60):
             return server
         if time.monotonic() > deadline or server.process.poll() is not None:
             raise RuntimeError(f"the server did not start: {server.output}")
         time.sleep(0.1)
+
+
+def _experiments(port: int) -> urllib.request.Request:
+    """Return a request for the experiments in the store."""
+    address = f"http://127.0.0.1:{port}/api/2.0/mlflow/experiments/search"
+    return urllib.request.Request(address, b'{"max_results": 1}', {"Content-Type": "application/json"})
 
 
 def _free_port() -> int:
