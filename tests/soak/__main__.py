@@ -311,6 +311,16 @@ RAY_NOTE = (
 """Line of the page on processes that Ray left."""
 
 
+STORE_NOTE = (
+    "In the fault of *the store and the run* (commit e3891c10), the test killed MLflow's server while the server "
+    "created its SQLite database. MLflow could not repair this database (`duplicate column name: run_link`), so "
+    "`mode=sync` said that the store did not accept the numbers. The journal of the run held all of them; journal and"
+    " weights equalled those of an undisturbed run. Since then, the test waits until the server has created its "
+    "database. The stores that the framework itself creates are complete before they have their name."
+)
+"""Paragraph of the page on the fault in which MLflow's own database was incomplete."""
+
+
 def page(soak: Soak, kinds: list[Soaked]) -> str:
     """Return the page of a soak test."""
     counts = soak.counts
@@ -363,6 +373,7 @@ def page(soak: Soak, kinds: list[Soaked]) -> str:
             *([*EVENT_ROWS, *events, ""] if events else ()),
             f"Faults: {'; '.join(counts.faults) or 'none'}.",
             "",
+            *([STORE_NOTE, ""] if counts.events.get("the store and the run", [0, 0, 0])[2] else ()),
             "The tests so far:",
             "",
             *(
