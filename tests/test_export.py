@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -27,6 +27,7 @@ from framework.configuration.schema import build, resolve
 from framework.data import Data
 from framework.density_head import DensityHead
 from framework.deployment import export as exporting
+from framework.deployment.exported_folder.predict import Model as ExportedModel
 from framework.distributions import numpy_densities as densities
 from framework.distributions.circular import wrap
 from framework.distributions.exported import exported
@@ -34,8 +35,11 @@ from framework.distributions.intervals import central_interval
 from framework.distributions.numpy_densities import Density
 from framework.distributions.protocol import median, value_set
 from framework.encoder import Encoder
-from framework.errors import ConfigError
+from framework.errors import ConfigError, UserError
+from framework.evaluation.prediction_sets import require_interval
 from framework.model import Model, Predictor
+from framework.modes.predict import interval_or_set_columns
+from framework.prediction import Prediction
 from framework.target import Target
 from framework.testing.contract import contract
 from framework.testing.finding import seed
@@ -230,6 +234,101 @@ def test_numpy_computes_the_same_prediction_sets(head: str, target: Target, thre
             assert true == found
         else:
             np.testing.assert_allclose(np.ravel(found), np.ravel(true), rtol=1e-6, atol=1e-6)
+
+
+class Computed(ExportedModel):
+    """Exported model whose densities are given, so that no network is traced."""
+
+    def __init__(self, density: Density, target: Target) -> None:
+        self.density = density
+        self.description = {"target": exporting.target_entry(target)}
+
+    def __call__(self, inputs: Any, seed: int = 0) -> Density:
+        return self.density
+
+
+def outcome(columns: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any] | str:
+    """Return the columns of intervals and sets, or the kind of the refusal."""
+    try:
+        found = columns()
+    except (ConfigError, ValueError) as error:
+        (kind,) = {
+            name
+            for name, words in {
+                "no interval": "no central interval|intervals of real numbers or angles, but",
+                "other probability": "no such guarantee",
+                "no ends": "predicts sets, which do not have",
+            }.items()
+            if re.search(words, str(error))
+        }
+        return kind
+    return {
+        name: cells for name, cells in found.items() if re.search("(_low|_high|set|set_size)(_deg)?$", name)
+    }
+
+
+def transpose(rows: Iterable[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Return rows of a table as columns."""
+    listed = list(rows)
+    return {name: [row[name] for row in listed] for name in listed[0]}
+
+
+INTERVAL_CASES = [
+    pytest.param(
+        name,
+        wrapper,
+        id=f"{name}: {wrapper or 'alone'}",
+        marks=[] if name == "gaussian" or wrapper == "conformal" else [pytest.mark.slow],
+    )
+    for name in HEADS
+    if rows(name)[0].target.kind != "image"
+    for wrapper in (None, *installed("uncertainty"))
+]
+
+
+@pytest.mark.parametrize(("name", "wrapper"), INTERVAL_CASES)
+def test_an_exported_model_and_mode_predict_print_the_same_intervals(name: str, wrapper: str | None) -> None:
+    """Both print the same ends and the same sets, or refuse the probability for the same reason."""
+    target = rows(name)[0].target
+
+    def inner() -> Model:
+        encoder = build("encoder", resolve("encoder", {"name": "mlp", "widths": [4]}), input_shape=(3,))
+        return Model([encoder], build_head(name, rows(name)[0]))
+
+    torch.manual_seed(0)
+    batch = {"input": torch.randn(40, 3), "target": values(target, (40,)), "index": torch.arange(40)}
+    try:
+        predictor: Predictor = inner()
+        if wrapper is not None:
+            predictor = build("uncertainty", resolve("uncertainty", wrapper), model=inner, target=target)
+            predictor.calibrate([batch])
+        with torch.no_grad():
+            density = predictor.eval()(batch["input"][:5])
+            own, estimated = as_numpy(density), any(exported(density).remarks())
+    except UserError as error:
+        pytest.skip(f"cannot be built or exported: {error}")
+
+    def predicted(mass: float | None) -> Mapping[str, Any]:
+        if mass:
+            require_interval(target, mass, by="mode.interval")
+        return interval_or_set_columns(target, Prediction(density, {}), mass)
+
+    for mass in (None, 0.5, 0.9):
+        expected = outcome(lambda mass=mass: predicted(mass))
+        printed = outcome(lambda mass=mass: transpose(Computed(own, target).table(batch["input"], mass)))
+        if isinstance(expected, str) or isinstance(printed, str):
+            assert printed == expected
+            continue
+        if len(target.names) > 1 and own.has_sets:
+            continue  # NumPy computes no volume of a set of several numbers
+        assert set(printed) == set(expected)
+        for column, cells in expected.items():
+            if column.endswith(("set", "set_deg")):
+                assert [len(json.loads(cell)) for cell in printed[column]] == [
+                    len(json.loads(x)) for x in cells
+                ]
+            elif not (own.by_draws or estimated):  # otherwise both draw random numbers
+                np.testing.assert_allclose(printed[column], cells, rtol=1e-4, atol=1e-4)
 
 
 class Arrays(Data):

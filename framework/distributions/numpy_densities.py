@@ -73,6 +73,8 @@ class Density:
             for heavy tails.
         by_draws: whether medians and intervals are estimated from DRAWS draws, because the densities of single angles
             are not known.
+        has_sets: whether each item of the batch has a prediction set.
+        stated_probability: probability with which a set is stated to contain the target; None if it is not stated.
     """
 
     batch: tuple[int, ...]
@@ -80,6 +82,8 @@ class Density:
     circular: bool = False
     reach: float = 40.0
     by_draws: bool = False
+    has_sets: bool = False
+    stated_probability: float | None = None
 
     @property
     def probabilities(self) -> Array:
@@ -819,6 +823,17 @@ class Affine(Density):
     def __init__(self, location: Array, scale: Array, inner: Density) -> None:
         self.location, self.scale, self.inner = location, scale, inner
         self.batch, self.event, self.reach = inner.batch, inner.event, inner.reach
+        self.has_sets, self.stated_probability = inner.has_sets, inner.stated_probability
+
+    def parts(self) -> list[Any] | None:
+        parts = self.inner.parts()
+        if parts is None:
+            return None
+        lines = zip(self.location.reshape(-1).tolist(), self.scale.reshape(-1).tolist(), parts, strict=True)
+        return [
+            [(shift + factor * low, shift + factor * high) for low, high in row]
+            for shift, factor, row in lines
+        ]
 
     def log_prob(self, value: Array) -> Array:
         return self.inner.log_prob((value - self.location) / self.scale) - np.log(self.scale).sum(-1)
@@ -860,6 +875,27 @@ class Affine(Density):
         inner = self.inner.bound((value - self.location) / self.scale)
         log_prob = inner.log_prob - np.log(self.scale).sum(-1)
         return Bound(log_prob, inner.gradient / self.scale, inner.curvature / self.scale**2)
+
+
+def hull(intervals: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Return the lowest and the highest end of `intervals`, which are in ascending order; NaN if there are none."""
+    return (intervals[0][0], intervals[-1][1]) if intervals else (math.nan, math.nan)
+
+
+def arc_hull(arcs: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Return the ends of the shortest arc that contains all `arcs` (degrees, ascending); NaN if there are none.
+
+    The shortest arc is the complement of the widest gap between two arcs. Its lower end is in [-180, 180), and its
+    upper end may exceed 180.
+    """
+    if not arcs:
+        return math.nan, math.nan
+    starts = [low for low, _ in arcs]
+    gaps = [after - high for (_, high), after in zip(arcs, [*starts[1:], starts[0] + 360], strict=True)]
+    last = max(range(len(gaps)), key=gaps.__getitem__)
+    first = (last + 1) % len(arcs)
+    high = arcs[last][1]
+    return starts[first], high if first == 0 else high + 360
 
 
 FAMILIES: dict[str, Any] = {

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from framework.distributions.intervals import Interval
+from framework.distributions.numpy_densities import arc_hull, hull
 from framework.distributions.protocol import ValueSet, value_set
 from framework.errors import ConfigError
 from framework.prediction import Prediction
@@ -46,33 +47,13 @@ def set_columns(target: Target, prediction: Prediction) -> dict[str, list[Any]]:
         return {"set": [json.dumps(row, ensure_ascii=False) for row in named], **size}
     name, suffix = target.names[0], "_deg" if degrees else ""
     listed: list[Ends] = [[(scale * low, scale * high) for low, high in row] for row in parts]  # type: ignore[misc]
-    hulls = [_arc_around(row) if degrees else _around(row) for row in listed]
+    hulls = [arc_hull(row) if degrees else hull(row) for row in listed]
     return {
         f"{name}_low{suffix}": [low for low, _ in hulls],
         f"{name}_high{suffix}": [high for _, high in hulls],
         f"{name}_set{suffix}": [json.dumps([list(pair) for pair in row]) for row in listed],
         **size,
     }
-
-
-def _around(intervals: Ends) -> tuple[float, float]:
-    """Return the lowest and the highest end of `intervals`, which are in ascending order; NaN if there are none."""
-    return (intervals[0][0], intervals[-1][1]) if intervals else (math.nan, math.nan)
-
-
-def _arc_around(arcs: Ends) -> tuple[float, float]:
-    """Return the ends of the shortest arc that contains all `arcs` (degrees, ascending).
-
-    The shortest arc is the complement of the widest gap between two arcs.
-    """
-    if not arcs:
-        return math.nan, math.nan
-    starts = [low for low, _ in arcs]
-    gaps = [after - high for (_, high), after in zip(arcs, [*starts[1:], starts[0] + 360], strict=True)]
-    last = max(range(len(gaps)), key=gaps.__getitem__)
-    first = (last + 1) % len(arcs)
-    high = arcs[last][1]
-    return starts[first], high if first == 0 else high + 360
 
 
 def require_interval(target: Target, mass: float, by: str) -> None:

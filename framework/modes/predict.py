@@ -131,7 +131,7 @@ def _apply_budget(session: Session, data: Data | None, mass: float | None) -> st
 
     def row(prediction: Prediction) -> None:
         table_columns(session.target, prediction)
-        _intervals(session.target, prediction, mass)
+        interval_or_set_columns(session.target, prediction, mass)
 
     assert session.stored is not None
     description = apply_budget(
@@ -196,7 +196,7 @@ def predictions(
         columns |= table_columns(target, prediction)
         if isinstance(data, Mapped) and files:
             mapped.append((prediction.point.cpu(), prediction.deviation().cpu()))
-        columns |= _intervals(target, prediction, mass)
+        columns |= interval_or_set_columns(target, prediction, mass)
         for key, column in columns.items():
             cells.setdefault(key, []).extend(format_cells(column, key))
     errors = [key for key in cells if key.endswith(ERRORS)] if mass else []
@@ -217,12 +217,15 @@ def _write_images(batch: Tensor, folder: Path, first: int) -> list[str]:
     return [f"{folder.name}/{name}" for name in names]
 
 
-def _intervals(
+def interval_or_set_columns(
     target: Target, prediction: Prediction, mass: float | None
 ) -> Mapping[str, Sequence[Any] | Tensor]:
     """Return the columns of the prediction sets or, if the model has none, of the intervals of probability `mass`.
 
     If the model has no sets and `mass` is None, there are no columns.
+
+    Raises:
+        ConfigError: the prediction sets have no ends, or not the probability `mass`.
     """
     sets = value_set(prediction.density)
     if sets is None:

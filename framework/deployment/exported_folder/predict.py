@@ -29,7 +29,7 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from framework.distributions.numpy_densities import Density, build
+from framework.distributions.numpy_densities import Density, arc_hull, build, hull
 
 MOST_POINTS = 2**13
 """Largest number of points that the network reads at once; more points do not fit into the caches."""
@@ -153,26 +153,28 @@ class Model:
         }
 
     def table(self, inputs: Any, interval: float | None = None) -> Iterator[dict[str, Any]]:
-        """Yield a row for each input: point prediction, entropy, ends of the central interval, and prediction set.
+        """Yield a row for each input: point prediction, entropy, and the ends of the interval or the prediction set.
+
+        The columns are those of `mode=predict`. A model with prediction sets has no other intervals: a row then holds
+        the set of the input, its size, and for one number the lowest and the highest end of the set. An end may be
+        infinite; the ends of an empty set are NaN.
 
         Args:
             inputs: inputs that a call of the model takes.
-            interval: probability of the interval; None leaves its ends out.
+            interval: probability of the central interval; None leaves its ends out. For a model with prediction sets,
+                only the stated probability of the sets is accepted.
 
         Raises:
-            ValueError: an interval is requested of classes or images, which have none.
+            ValueError: an interval is requested of classes or images, which have none, or one that the prediction sets
+                of the model do not give.
         """
         density = self(inputs)
         target = self.description["target"]
         names: list[str] = target["names"]
         entropy = density.entropy()
-        if interval is not None and len(density.event) != 1:
-            kind = "images" if density.event else "classes"
-            raise ValueError(
-                f"Got the interval {interval:g}, but the model predicts {kind}, which have no central interval. Leave "
-                "the interval out."
-            )
-        ends = None if interval is None else density.interval(interval)
+        if interval is not None:
+            _require_interval(density, interval)
+        ends = None if interval is None or density.has_sets else density.interval(interval)
         if not density.event:
             shares = density.probabilities
         point = density.mode() if not density.event else density.median()
@@ -190,17 +192,43 @@ class Model:
                     if ends is not None:
                         cells[f"{name}_low{mark}"] = unit * float(ends.low[row, column])
                         cells[f"{name}_high{mark}"] = unit * float(ends.high[row, column])
-            if sets is not None:
-                cells["set"] = json.dumps(
-                    [names[label] for label in sets[row]]
-                    if not density.event
-                    else [[unit * float(low), unit * float(high)] for low, high in sets[row]],
-                    ensure_ascii=False,
-                )
+            if sets is not None and not density.event:
+                labels = [names[label] for label in sets[row]]
+                cells |= {"set": json.dumps(labels, ensure_ascii=False), "set_size": float(len(labels))}
+            elif sets is not None:
+                pairs = [(unit * float(low), unit * float(high)) for low, high in sets[row]]
+                low, high = arc_hull(pairs) if density.circular else hull(pairs)
+                cells |= {f"{names[0]}_low{mark}": low, f"{names[0]}_high{mark}": high}
+                cells[f"{names[0]}_set{mark}"] = json.dumps(pairs)
+                cells[f"set_size{mark}"] = sum(end - start for start, end in pairs)
             cells["entropy_nats"] = float(entropy.value[row])
             if entropy.error[row]:
                 cells["entropy_error_nats"] = float(entropy.error[row])
             yield cells
+
+
+def _require_interval(density: Density, interval: float) -> None:
+    """Raise an error if densities have no interval of the requested probability, or a set that contradicts it."""
+    if len(density.event) != 1:
+        kind = "images" if density.event else "classes"
+        raise ValueError(
+            f"Got the interval {interval:g}, but the model predicts {kind}, which have no central interval. Leave "
+            "the interval out."
+        )
+    if not density.has_sets:
+        return
+    stated = density.stated_probability
+    if stated is None or density.event != (1,):
+        raise ValueError(
+            f"Got the interval {interval:g}, but the model predicts sets, which do not have the ends of such an "
+            "interval. Leave the interval out."
+        )
+    if not math.isclose(stated, interval, abs_tol=1e-9):
+        raise ValueError(
+            f"Got the interval {interval:g}, but the model predicts sets that contain the target with probability "
+            f"{stated:g}; intervals of another probability have no such guarantee. Give the interval {stated:g}, or "
+            "leave it out; the columns of the sets are always printed."
+        )
 
 
 def load(folder: str | Path = Path(__file__).parent, threads: int = 1) -> Model:
@@ -357,7 +385,7 @@ def main(arguments: Mapping[str, Any] | None = None) -> None:
     """Print the predictions for a file as CSV."""
     parser = argparse.ArgumentParser(description="Print the predictions of an exported model as CSV.")
     parser.add_argument("inputs", type=Path, help="a .npy file, or for a table a CSV file with a header")
-    parser.add_argument("--interval", type=float, help="probability of a central interval, such as 0.9")
+    parser.add_argument("--interval", type=float, help="probability of an interval, such as 0.9")
     options = parser.parse_args() if arguments is None else argparse.Namespace(**arguments)
     model = load()
     try:

@@ -85,7 +85,13 @@ def _answer(model: Model, content: bytes, binary: bool, interval: Any) -> bytes:
     count = len(inputs) if isinstance(inputs, list) or inputs.ndim else 0
     if count > MOST_ROWS:
         raise ValueError(f"Got {count} inputs, but at most {MOST_ROWS} are allowed in a request.")
-    return json.dumps({"predictions": list(model.table(inputs, level))}).encode()
+    rows = [{name: _finite(cell) for name, cell in row.items()} for row in model.table(inputs, level)]
+    return json.dumps({"predictions": rows}).encode()
+
+
+def _finite(cell: Any) -> Any:
+    """Return a cell, but None for a number that JSON lacks: an infinite end of a set, or NaN for an empty set."""
+    return None if isinstance(cell, float) and not math.isfinite(cell) else cell
 
 
 async def _read(request: Request) -> bytes:
@@ -139,7 +145,7 @@ def application() -> FastAPI:
     """Return the service of the model in this file's folder, after a first prediction, so that no request waits."""
     model = load(Path(__file__).parent)
     shape = [1 if isinstance(size, str) else size for size in model.description["input"]["shape"]]
-    list(model.table(np.zeros(shape), None if model.description["target"]["kind"] == "class" else 0.9))
+    list(model.table(np.zeros(shape)))
     return service(model)
 
 

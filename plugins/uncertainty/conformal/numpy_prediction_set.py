@@ -14,10 +14,12 @@ class PredictionSet(Density):
     Args:
         inner: the density.
         threshold: nats; infinite if the set holds every value.
-        stated_probability: probability with which a set is stated to hold the target.
+        stated_probability: probability with which a set is stated to hold the target; None if it is not known.
     """
 
-    def __init__(self, inner: Density, threshold: float | str, stated_probability: float) -> None:
+    has_sets = True
+
+    def __init__(self, inner: Density, threshold: float | str, stated_probability: float | None) -> None:
         self.inner, self.threshold, self.stated_probability = inner, float(threshold), stated_probability
         self.batch, self.event, self.circular, self.by_draws = (
             inner.batch,
