@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.fuzz.kills import ROOT, Tally, killed, start
+from tests.fuzz.kills import ROOT, Moments, Tally, killed, start
 from tests.slurm_cluster import missing_programs
 from tests.soak.__main__ import RECORD, Counts, State, read_tests
 from tests.soak.kinds import all_kinds
@@ -84,7 +84,8 @@ def test_jobs_that_are_killed_end_with_the_results_of_undisturbed_jobs(tmp_path:
     whole.parent.mkdir()
     command = start(kind, whole)
     assert command.process.wait(timeout=300) == 0, command.output.read_text()
+    moments = Moments.measured(kind, whole, 60.0)
     tallies: dict[int, Tally] = {}
-    assert killed(kind, tmp_path / "killed", whole, 60.0, 2, random.Random(0), tallies) == []
+    assert killed(kind, tmp_path / "killed", whole, moments, 2, random.Random(0), tallies) == []
     [tally] = tallies.values()
     assert tally.kills == tally.closed == tally.same >= 1

@@ -21,7 +21,7 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 
@@ -267,13 +267,40 @@ def shortest_job(kind: Kind, folder: Path) -> float:
     return min((record["ended"] - record["started"] for record in records), default=0.0)
 
 
+@dataclass(frozen=True)
+class Moments:
+    """Times from which the moments of kills are drawn, and the time after which a command counts as hanging.
+
+    Attributes:
+        command: Seconds of the command without a kill.
+        job: Seconds of the shortest job of a sweep without a kill; 0 for a command that is not a sweep.
+        patience: Seconds after which a command counts as hanging.
+    """
+
+    command: float
+    job: float
+    patience: float
+
+    @classmethod
+    def measured(cls, kind: Kind, whole: Path, seconds: float, pace: float = 1.0) -> Self:
+        """Return the times for a command that took `seconds` without a kill.
+
+        Args:
+            kind: Kind of the command.
+            whole: Folder of the run or sweep without a kill.
+            seconds: Seconds that it took.
+            pace: Factor for both times, below 1 if the machine is less busy now.
+        """
+        return cls(pace * seconds, pace * shortest_job(kind, whole), 20 * seconds)
+
+
 def start(kind: Kind, run: Path) -> Command:
     """Start the command of a run or sweep in the folder `run`; its output goes to the folder above."""
     return Command(kind.command(run), run.parent, **{"PYTHONPATH": str(ROOT), **kind.environment})
 
 
 def killed(
-    kind: Kind, folder: Path, whole: Path, duration: float, kills: int, draw: random.Random, tallies: dict[int, Tally]
+    kind: Kind, folder: Path, whole: Path, moments: Moments, kills: int, draw: random.Random, tallies: dict[int, Tally]
 ) -> list[str]:  # fmt: skip
     """Kill one run or sweep `kills` times, let it finish, and compare it with the run that was not killed.
 
@@ -285,16 +312,15 @@ def killed(
     folder.mkdir(parents=True)
     done: list[int] = []
     command: Command | None = None
-    job_seconds = shortest_job(kind, whole)
     while len(done) < kills:
         number = kind.numbers[sum(tally.kills for tally in tallies.values()) % len(kind.numbers)]
         share = draw.uniform(0.1, 0.9) if command is None else draw.uniform(0.05, 0.3)
-        deadline = time.monotonic() + share * duration
+        deadline = time.monotonic() + share * moments.command
         command = command or start(kind, folder / "it")
         if kind.goes_on:
             while command.process.poll() is None and not kind.choose(command):
                 time.sleep(0.05)
-            deadline = time.monotonic() + draw.uniform(0.0, 0.4) * job_seconds
+            deadline = time.monotonic() + draw.uniform(0.0, 0.4) * moments.job
         while command.process.poll() is None and (
             time.monotonic() < deadline or not (victims := kind.choose(command))
         ):
@@ -324,11 +350,11 @@ def killed(
             tally.closed += all(status(run) != "RUNNING" for run in runs(kind, folder / "it"))
             command = None
     if kind.goes_on and command is not None:
-        command.process.wait(timeout=20 * duration)
+        command.process.wait(timeout=moments.patience)
         closed = all(status(run) != "RUNNING" for run in runs(kind, folder / "it"))
         for number in done:
             tallies[number].closed += closed
-    start(kind, folder / "it").process.wait(timeout=20 * duration)
+    start(kind, folder / "it").process.wait(timeout=moments.patience)
     wanted = [run.relative_to(whole) for run in runs(kind, whole)]
     faults = [
         difference
@@ -354,7 +380,7 @@ def measure(kind: Kind, kills: int, draw: random.Random, base: Path) -> list[str
     whole.parent.mkdir(parents=True)
     began = time.monotonic()
     code = start(kind, whole).process.wait(timeout=600)
-    duration = time.monotonic() - began
+    moments = Moments.measured(kind, whole, time.monotonic() - began)
     if code:
         raise RuntimeError(f"{kind.name} failed: {whole.parent / 'output.txt'}")
     tallies: dict[int, Tally] = {}
@@ -362,7 +388,7 @@ def measure(kind: Kind, kills: int, draw: random.Random, base: Path) -> list[str
         left = kills - sum(tally.kills for tally in tallies.values())
         if left <= 0:
             break
-        killed(kind, base / str(attempt), whole, duration, min(left, IN_A_ROW), draw, tallies)
+        killed(kind, base / str(attempt), whole, moments, min(left, IN_A_ROW), draw, tallies)
     return [
         f"| {kind.name} | {signal.Signals(number).name} | {tally.kills} | {tally.ended} ({tally.slowest:.1f} s) | "
         f"{tally.closed} | {tally.same} |"

@@ -31,7 +31,7 @@ from typing import Any, Self
 
 from benchmarks.pages import environment, write_page
 from framework.storage.files import hold_lock, write_whole
-from tests.fuzz.kills import ALLOWED, MARK, ROOT, RUN, Kind, Tally, killed, start
+from tests.fuzz.kills import ALLOWED, MARK, ROOT, RUN, Kind, Moments, Tally, killed, start
 from tests.slurm_cluster import SlurmCluster, missing_programs
 from tests.soak.events import EVENTS
 from tests.soak.kinds import Soaked, all_kinds, prepare
@@ -122,10 +122,12 @@ class State(Counts):
 
     Attributes:
         durations: Seconds of each command without a kill.
+        paces: Factors for these seconds, by kind; below 1 if commands finish before a kill.
         attempts: Number of commands that were killed, by kind.
     """
 
     durations: dict[str, float] = field(default_factory=dict)
+    paces: dict[str, float] = field(default_factory=dict)
     attempts: dict[str, int] = field(default_factory=dict)
 
     @classmethod
@@ -171,15 +173,16 @@ class Soak:
         kind, name = soaked.kind, soaked.kind.name
         reference = soaked.reference or kind
         whole = self.whole(reference)
-        self.state.durations.setdefault(name, self.state.durations[reference.name])
         number = self.state.attempts[name] = self.state.attempts.get(name, 0) + 1
         tallies = self.state.tallies.setdefault(name, {})
         draw = random.Random(f"{self.state.began} {name} {number}")
         folder = self._empty(f"{_slug(name)}-{number}")
         before = self.state.kills(name)
-        faults = killed(kind, folder, whole, self.state.durations[name], most, draw, tallies)
+        pace = self.state.paces.get(name, 1.0)
+        moments = Moments.measured(reference, whole, self.state.durations[reference.name], pace)
+        faults = killed(kind, folder, whole, moments, most, draw, tallies)
         if self.state.kills(name) < before + most:  # it finished before a kill
-            self.state.durations[name] *= 0.7
+            self.state.paces[name] = pace / 2
         self._note(name, number, faults, folder)
         return faults
 
