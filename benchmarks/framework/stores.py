@@ -329,8 +329,9 @@ HEAD = [
     "",
     "This page tests an MLflow server that has a PostgreSQL database and asks for passwords. It says whether all "
     "numbers and files of runs arrive if the server is killed during the runs, and how much time and memory the server "
-    "takes. Server, database and runs share one machine. [docs/stores.md](../../docs/stores.md) says how to start the "
-    "server. Command: `python -m benchmarks.framework.stores`.",
+    "takes. Server, database and runs share one machine. Other programs may have used this machine as well during the "
+    "first two tests, so their durations are upper bounds. [docs/stores.md](../../docs/stores.md) says how to start "
+    "the server. Command: `python -m benchmarks.framework.stores`.",
 ]
 
 
