@@ -87,7 +87,7 @@ def ply(content: bytes) -> Parsed:
     end = re.search(rb"(?:^|[\r\n])end_header[ \t]*" + last, content)
     if not content.startswith(b"ply") or end is None:
         raise ValueError(
-            "the file lacks the word ply at its beginning, or the line end_header that ends a PLY header"
+            "the file lacks the word `ply` at its beginning, or the line `end_header` that ends a PLY header"
         )
     order, elements = _header(content[: end.start()])
     names = {element.name for element in elements}
@@ -98,7 +98,7 @@ def ply(content: bytes) -> Parsed:
     if "vertex" not in names:
         raise ValueError(
             f"the header lists the elements {shorten(', '.join(sorted(names))) or 'none'}; expected an element named "
-            "vertex"
+            "`vertex`"
         )
     body = content[end.end() :]
     for element in elements:
@@ -148,7 +148,7 @@ def _header(content: bytes) -> tuple[str, list[Element]]:
                 f"expected a line of a PLY header (format, element, property, comment or obj_info), got {header_line}"
             ) from None
     if order is None:
-        raise ValueError("the header lacks a line that begins with the word format")
+        raise ValueError("the header lacks a line that begins with `format`")
     return order, elements
 
 

@@ -168,7 +168,8 @@ class XGBoostHead(DensityHead, Fitted):
         ):
             raise ValueError(
                 f"the stored `model` has the shape {content.shape}, and `read`, the number of features that the trees "
-                f"read, is {size.tolist()}; expected a row of bytes and a number from 1, or no bytes and 0"
+                f"read, is {size.tolist()}; expected either a row of bytes in `model` and at least 1 feature in "
+                "`read`, or no bytes and 0 features"
             )
         if len(content):
             require_boosting(content.tobytes(), self.classes, self.numbers, int(size))
