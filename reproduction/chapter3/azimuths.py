@@ -3,10 +3,10 @@
     python -m reproduction.thesis_tables 3.3
     python -m reproduction.chapter3.azimuths outputs/thesis_tables/pascal3d outputs/thesis_tables/pascal3d_classes
 
-The models of Table 3.3 predict the test images of the classes that look different from every side. The script measures
-whether a density is wide where its prediction is wrong (thesis Figures 3.2, 3.6) and for blurred images (§3.1), how
-often it confidently takes the back for the front (Figure 3.6), and whether the median has a smaller error than the mode
-(§3.1, eq. 3.23). It writes azimuths.md beside this file.
+The models of Table 3.3 predict the azimuth for the test images of those classes whose objects look different from every
+side. The script measures whether a density is wide where its prediction is wrong (thesis Figures 3.2, 3.6) and for
+blurred images (§3.1), how often it confidently takes the back for the front (Figure 3.6), and whether the median has a
+smaller error than the mode (§3.1, eq. 3.23). It writes azimuths.md beside this file.
 """
 
 import math
@@ -180,9 +180,9 @@ def main() -> None:
     text = (
         "# Do azimuth densities know their own errors? (synthetic data)\n\n"
         "This page measures whether predicted densities of the azimuth, the horizontal viewpoint angle, are wide where "
-        "the prediction is wrong. The page [pascal3d.md](pascal3d.md) describes the models. They predict the test "
-        "images of "
-        "the classes that look different from every side; a quarter of these images is blurred.\n\n"
+        "the prediction is wrong. The page [pascal3d.md](pascal3d.md) describes the models. Here they predict the "
+        "azimuth for the test images of those classes whose objects look different from every side. A quarter of these "
+        "images is blurred.\n\n"
         "A number in the table is the mean over classes of objects, and ± is its standard error over classes. The "
         "value of a class is the mean over its seeds. A dash means that the method has the same concentration, "
         "and therefore the same entropy, for all images. The column **classes** is the number of classes over "

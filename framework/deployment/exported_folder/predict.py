@@ -155,9 +155,9 @@ class Model:
     def table(self, inputs: Any, interval: float | None = None) -> Iterator[dict[str, Any]]:
         """Yield a row for each input: point prediction, entropy, and the ends of the interval or the prediction set.
 
-        The columns are those of `mode=predict`. A model with prediction sets has no other intervals: a row then holds
-        the set of the input, its size, and for one number the lowest and the highest end of the set. An end may be
-        infinite; the ends of an empty set are NaN.
+        The columns are named as those of `mode=predict`. A model with prediction sets has no other intervals: a row
+        then holds the set of the input, its size, and for one number the lowest and the highest end of the set. An end
+        may be infinite; the ends of an empty set are NaN.
 
         Args:
             inputs: inputs that a call of the model takes.
@@ -165,8 +165,8 @@ class Model:
                 only the stated probability of the sets is accepted.
 
         Raises:
-            ValueError: an interval is requested of classes or images, which have none, or one that the prediction sets
-                of the model do not give.
+            ValueError: an interval is requested, but the model predicts classes or images, which have none, or
+                prediction sets that do not give an interval of this probability.
         """
         density = self(inputs)
         target = self.description["target"]
@@ -208,7 +208,7 @@ class Model:
 
 
 def _require_interval(density: Density, interval: float) -> None:
-    """Raise an error if densities have no interval of the requested probability, or a set that contradicts it."""
+    """Raise an error if the model gives no intervals, or has prediction sets that do not give the requested one."""
     if len(density.event) != 1:
         kind = "images" if density.event else "classes"
         raise ValueError(

@@ -77,7 +77,7 @@ class Framing:
         return Crop(annotation.image, annotation.box, self.margin, self.image_size)
 
     def scale(self, box: Box) -> float:
-        """Return the number of pixels of the input per pixel of the image, for a crop around `box` with the margin."""
+        """Return the number of pixels of the input per pixel of the image, for a crop around `box` with `margin`."""
         left, top, right, bottom = box
         return self.image_size / ((1 + 2 * self.margin) * max(right - left, bottom - top))
 

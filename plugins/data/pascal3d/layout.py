@@ -79,7 +79,7 @@ class Content:
 
 
 def parsed_annotations(root: Path, category: str) -> ParsedFiles[Content]:
-    """Return the contents of the annotation files of a class that earlier commands parsed."""
+    """Return the cached contents of the annotation files of a class, as earlier commands parsed them."""
     return ParsedFiles(root, f"pascal3d-{category}", Content, (Path(__file__), Path(matlab.__file__)))
 
 
@@ -159,7 +159,7 @@ def read_annotations(
         category: Name of the class.
         source: Source of the image, "pascal" or "imagenet".
         name: Name of the image, without its ending.
-        parsed: Contents that need not be parsed again (`parsed_annotations`).
+        parsed: Cached contents of files, which are not parsed again (`parsed_annotations`).
 
     Raises:
         DataError: The file is missing, is not a MATLAB file, or does not have the structure of an annotation.

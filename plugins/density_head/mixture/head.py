@@ -28,7 +28,7 @@ class MixtureHead(DensityHead):
     known which samples belong to which component.
 
     Args:
-        components: K. With 1 the density is the component, to the last bit.
+        components: K. With 1 the density is that of `component`, to the last bit.
         component: the head whose densities are mixed.
     """
 

@@ -65,9 +65,9 @@ class MeshSettings:
 class Rasterised(Encoder):
     """Rendered image of a registered body with vertex colours or a texture, on white, in the canonical camera.
 
-    Inputs are the coloured vertices of `data=human_scans`, in the order of the topology. Colours are interpolated and
-    averaged in linear RGB. Textures lie in the folder of the data and are read when they are first drawn. Features are
-    (3, height, width), sRGB numbers in [0, 1], in the inputs' dtype; with `depth` they are (4, height, width), like
+    Inputs are the coloured vertices of `data=human_scans`, in the order of `mesh.topology`. Colours are interpolated
+    and averaged in linear RGB. Textures lie in the folder of the data and are read when they are first drawn. Features
+    are (3, height, width), sRGB numbers in [0, 1], in the inputs' dtype; with `depth` they are (4, height, width), like
     those of `encoder=projection`. A network can read these features instead of projected points. With `ground` the
     image is only the silhouette, black on white.
 
@@ -169,8 +169,8 @@ class Rasterised(Encoder):
 def load_faces(mesh: MeshSettings) -> Tensor:
     """Return the triangles of the mesh as vertex indices, (faces, 3).
 
-    If `mesh.root` is set, they are read from the registration of the first training subject in this folder; otherwise
-    they are the triangles of the body model in the topology.
+    If `mesh.root` is set, the triangles are read from the registration of the first training subject in this folder.
+    Otherwise they are those of the mesh topology `mesh.topology` of the body model.
 
     Raises:
         DataError: the body, or the meshes in the folder, are not available.

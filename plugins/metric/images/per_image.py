@@ -33,6 +33,7 @@ class PerImage(Metric, HasFigure):
 
     reads: ClassVar[frozenset[str]] = frozenset({"color"})
     keys: tuple[str, ...]
+    """Names of the numbers that `judge` returns, in the same order."""
     masked: bool
     """True if `judge` receives the true masks."""
     numbers: list[Tensor]
@@ -55,7 +56,7 @@ class PerImage(Metric, HasFigure):
 
     @abstractmethod
     def judge(self, predicted: Tensor, true: Tensor, mask: Tensor | None) -> list[Float[Tensor, ""]]:
-        """Return the numbers of one image, in the order of the keys.
+        """Return the numbers of one image, in the order of `keys`.
 
         Args:
             predicted: the predicted image, (height, width[, channel]).

@@ -76,7 +76,7 @@ def leaving_out(wrapper: SelfTraining, part: int) -> Iterator[None]:
 
 
 class IntervalSet(Unchanged, ValueSet):
-    """A density of one real number, unchanged to the last bit, and an interval for each item.
+    """A density of one real number, unchanged to the last bit, and an interval for each item of the batch.
 
     Args:
         density: any density of one real number.
@@ -116,7 +116,7 @@ class IntervalSet(Unchanged, ValueSet):
         return [[pair] if pair[0] <= pair[1] else [] for pair in pairs]
 
     def parts(self) -> list[list[tuple[float, float]]]:
-        """Return the intervals of every item, as `intervals` does."""
+        """Return one list for each item of the flattened batch, the same as `intervals` does."""
         return self.intervals()
 
 
