@@ -180,8 +180,8 @@ def measure_loss(server: StoreServer) -> list[str]:
         "send the remaining lines until it gave up. The server was started again "
         f"after the end of the command; the store lacked {before.lost:,} numbers and {before.files_lost} files. "
         f"Then `python -m framework mode=sync mode.run=<folder of the sweep>` sent {sent:,} lines in "
-        f"{duration:.0f} s. Repeated, it sent {again} lines and changed nothing. The journals were compared with "
-        "the store:",
+        f"{duration:.0f} s. The repeated command sent {again} lines and changed nothing. The journals were compared "
+        "with the store:",
         "",
         *TABLE,
         *rows(after),
@@ -330,8 +330,8 @@ HEAD = [
     "This page tests an MLflow server that has a PostgreSQL database and asks for passwords. It says whether all "
     "numbers and files of runs arrive if the server is killed during the runs, and how much time and memory the server "
     "takes. Server, database and runs share one machine. Other programs may have used this machine as well during the "
-    "first two tests, so their durations are upper bounds. [docs/stores.md](../../docs/stores.md) says how to start "
-    "the server. Command: `python -m benchmarks.framework.stores`.",
+    "first two tests, so the durations of these tests are upper bounds. [docs/stores.md](../../docs/stores.md) says "
+    "how to start the server. Command: `python -m benchmarks.framework.stores`.",
 ]
 
 

@@ -288,7 +288,7 @@ class Moments:
         Args:
             kind: Kind of the command.
             whole: Folder of the run or sweep without a kill.
-            seconds: Seconds that it took.
+            seconds: Seconds that the command took without a kill.
             pace: Factor for both times, below 1 if the machine is less busy now.
         """
         return cls(pace * seconds, pace * shortest_job(kind, whole), 20 * seconds)
