@@ -315,23 +315,26 @@ WRITTEN = {
     "1'234": {"thousands": "apostrophe"},
     "5%": {"units": ["%"]},
     "$5": {"units": ["$"]},
-    "-$5": {"units": ["$"]},
+    "$1,234.5": {"units": ["$"], "thousands": "comma"},
     "5 km/h": {"units": ["km/h"]},
     "1.234,5 €": {"units": ["€"], "decimal": "comma", "thousands": "point"},
     "12°": {"units": ["°"]},
+    "12.5 °C": {"units": ["°C"]},
+    "3 mm²": {"units": ["mm²"]},
 }
-VALUES = (1.5, 1234.5, 1234.0, 1234.0, 1234.0, 1234.0, 5.0, 5.0, -5.0, 5.0, 1234.5, 12.0)
+VALUES = (1.5, 1234.5, 1234.0, 1234.0, 1234.0, 1234.0, 5.0, 5.0, 1234.5, 5.0, 1234.5, 12.0, 12.5, 3.0)
 
 
+@pytest.mark.parametrize("sign", ["", "-", "+", "\N{MINUS SIGN}"])
 @pytest.mark.parametrize("word", WRITTEN)
 def test_a_column_written_otherwise_is_refused_and_read_by_the_setting_that_is_told(
-    tmp_path: Path, word: str
+    tmp_path: Path, word: str, sign: str
 ) -> None:
     file = tmp_path / "one.csv"
     file.write_text(
-        "file;a;b\n" + "".join(f"{row}.png;{word};{row / 8}\n" for row in range(30)), encoding="utf-8"
+        "file;a;b\n" + "".join(f"{row}.png;{sign}{word};{row / 8}\n" for row in range(30)), encoding="utf-8"
     )
-    wanted = VALUES[list(WRITTEN).index(word)]
+    wanted = VALUES[list(WRITTEN).index(word)] * (-1 if sign in ("-", "\N{MINUS SIGN}") else 1)
     plain = read_columns(file, Writing())
     with pytest.raises(DataError, match=r"one\.csv line 2, column 'a'") as raised:
         numeric_columns(plain, ("file",), "data.columns")

@@ -135,8 +135,11 @@ def trim(cell: str) -> str:
 
 
 def column_name(cell: str) -> str:
-    """Return the name of a column from its header cell: trimmed, without quotation marks, composed (NFC)."""
-    name = trim(cell)
+    """Return the name of a column from its header cell.
+
+    The name is on one line, trimmed, without quotation marks, composed (NFC).
+    """
+    name = re.sub(r"\s*[\r\n]\s*", " ", trim(cell))
     if len(name) > 1 and name[0] == name[-1] and name[0] in "\"'":
         name = trim(name[1:-1])
     return unicodedata.normalize("NFC", name)
@@ -223,10 +226,10 @@ OTHERS: tuple[tuple[str, str, str], ...] = (
 )
 """Patterns of numbers that no setting reads, each with a name of the form and a template for the plain number."""
 UNIT = re.compile(
-    r"([+-]?)([A-Z]{3}(?=[ \xa0])|[^\w\s.,()+\-'\"<>≤≥~≈=#]{1,3})?\s*([+-]?[\d.,].*?)\s*"
-    r"([^\W\d_]{1,8}(?:/[^\W\d_]{1,4})?[²³]?|[^\w\s.,()+\-'\"#*]{1,3})?"
+    r"([+-]?)(?:([A-Z]{3}(?=[ \xa0])|[^\w\s.,()+\-'\"<>≤≥~≈=#]{1,3})\s*)?([+-]?[\d.,].*?)\s*"
+    r"(°[CFK]|[^\W\d_]{1,8}(?:/[^\W\d_]{1,4})?[²³]?|[^\w\s.,()+\-'\"#*]{1,3})?"
 )
-"""Pattern of a sign, a unit before the number ($, EUR), the number, and a unit after the number (%, kg, mm²)."""
+"""Pattern of a sign, a unit before the number ($, EUR), the number, and a unit after the number (%, kg, mm², °C)."""
 
 
 def suggest_number(word: str) -> Suggestion | None:
@@ -270,7 +273,7 @@ def _separated(sign: str, figures: str) -> Suggestion | None:
 
 def _with_unit(word: str) -> Suggestion | None:
     match = UNIT.fullmatch(word)
-    if match is None or not (match[2] or match[4]) or (match[1] and not match[2]):
+    if match is None or not (match[2] or match[4]):
         return None
     unit = match[2] or match[4]
     if (match[2] and match[4]) or match[3].endswith("."):  # a file name such as 0.png
