@@ -1,4 +1,5 @@
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -139,8 +140,8 @@ WRONG = {
     "not closed": (lambda text: text.replace("}\nMOTION", "MOTION"), "lacks its closing brace"),
     "a word": (lambda text: text.replace("OFFSET", "OFFSTE", 1), "OFFSTE"),
     "too few numbers": (lambda text: text.rpartition(" ")[0], "channels"),
-    "no number": (lambda text: text.replace("MOTION\nFrames: 3", "MOTION\nFrames: 0"), "channels"),
-    "not finite": (lambda text: text.rpartition(" ")[0] + " nan", "channels"),
+    "not finite": (lambda text: text.rpartition(" ")[0] + " nan", r"line \d+: nan is not a finite number"),
+    "no frames": (lambda text: re.sub(r"Frames: \d+", "Frames: 0", text), "states 0 frames, expected 1 to"),
 }
 
 

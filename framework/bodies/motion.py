@@ -90,11 +90,17 @@ def read(file: Path) -> Motion:
         if not 0 < seconds < SLOWEST:
             raise ValueError(f"a frame lasts {seconds:g} s, expected more than 0 and less than {SLOWEST:g} s")
         columns = sum(map(len, channels))
-        if not 1 <= frames <= LONGEST or numbers.size != frames * columns or not np.isfinite(numbers).all():
+        if not 1 <= frames <= LONGEST:
+            raise ValueError(f"the file states {frames} frames, expected 1 to {LONGEST}")
+        if numbers.size != frames * columns:
             raise ValueError(
-                f"the file has {numbers.size} numbers after the frame time, expected {frames * columns} finite ones "
-                f"for {frames} frames of {columns} channels"
+                f"the file has {numbers.size} numbers after the frame time, expected {frames * columns} for {frames} "
+                f"frames of {columns} channels"
             )
+        if not np.isfinite(numbers).all():
+            bad = int(np.flatnonzero(~np.isfinite(numbers))[0])
+            line = line_of_word(text, before + 5 + bad)
+            raise ValueError(f"line {line}: {words[5 + bad]} is not a finite number")
         values = numbers.reshape(frames, columns)
         turns, first = np.empty((frames, len(names), 3, 3)), 0
         for joint, kinds in enumerate(channels):
