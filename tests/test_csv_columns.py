@@ -38,6 +38,28 @@ def test_an_empty_cell_in_a_table_of_one_column_is_a_row(tmp_path: Path) -> None
     np.testing.assert_array_equal(numbers(columns, "a", missing=None), [1.0, math.nan, 3.0])
 
 
+@pytest.mark.parametrize("eol", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize(
+    ("header", "names"),
+    [
+        ("a;b", ("a", "b")),
+        ('"a\n(cm)";b', ("a (cm)", "b")),  # a line break that a spreadsheet allows in a cell
+        ('a;"b\n\n(x, y)"', ("a", "b (x, y)")),
+        ("a, cm;b", ("a, cm", "b")),
+        ("a, cm;b, kg", ("a, cm", "b, kg")),
+        ('a";b', ('a"', "b")),
+    ],
+)
+@pytest.mark.parametrize("sign", [";", "\t", "|"])
+def test_the_separator_is_found_by_the_names_and_the_first_row(
+    tmp_path: Path, sign: str, header: str, names: tuple[str, str], eol: str
+) -> None:
+    text = "\n".join([header.replace(";", sign), f"0,5{sign}1", "", f"2{sign}3", ""]).replace("\n", eol)
+    columns = read_columns(written(tmp_path, text))
+    assert columns.cells == {names[0]: ["0,5", "2"], names[1]: ["1", "3"]}
+    assert columns.lines == [2 + header.count("\n"), 4 + header.count("\n")]
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -46,6 +68,11 @@ def test_an_empty_cell_in_a_table_of_one_column_is_a_row(tmp_path: Path) -> None
         ("a,b", "has no row below its first line"),
         ("a,b\n,\n\n", "has no row below its first line"),
         ("a b\n1 2\n3 4", r"is separated by blanks: its first line is 'a b'. Commas"),
+        ('"a" "b"\n"1" 2\n', "blanks separate the cells; set data.separator=space"),
+        (
+            "measured today\n\na,b\n1,2",
+            r"line 3: the line has 2 cells, .* such as a title, stand above the names",
+        ),
         ("1,2\n3,4", r"line 1: '1, 2' are numbers, but the first line must name the columns"),
         ("a,b,a\n1,2,3", "the column 'a' is named twice"),
         (",a\nx,1", r"column 1 has no name, but holds 'x', which is not a row number"),

@@ -50,6 +50,8 @@ CELLS_AT_ONCE = 2**9
 """Number of cells that are sorted into columns at once, which is several times as fast as one by one."""
 MOST_LOOKED_AT = 2000
 """Largest number of cells, evenly spaced in a column of words, that are checked for numbers in another notation."""
+FIRST_LINES = 40
+"""Number of lines in which the separator of a table is looked for."""
 MOST_LISTED = 12
 """Largest number of columns that a sentence lists."""
 Separator = Literal["comma", "semicolon", "tab", "bar", "space", ",", ";", "\t", "|", " "]
@@ -258,25 +260,58 @@ def csv_rows(file: Path, missing: str, writing: Writing | None = None) -> Iterat
 
 
 def _rows(lines: io.TextIOWrapper, writing: Writing) -> Any:
-    first = lines.readline()
-    stated = re.fullmatch(r"sep=(.)\s*", first)  # the line in which Excel states the separator
-    sign = stated[1] if stated else writing.delimiter or _separator(first)
-    rest = _with_first(first, lines)
+    start = list(itertools.islice(lines, FIRST_LINES))
+    stated = (
+        re.fullmatch(r"sep=(.)\s*", start[0]) if start else None
+    )  # Excel states the separator in such a line
+    sign = stated[1] if stated else writing.delimiter or _separator(start)
+    rest = itertools.chain(start, lines)
     if sign == " ":
         return csv.reader(rest, strict=True, delimiter=" ", skipinitialspace=True)
     return csv.reader(rest, strict=True, delimiter=sign)
 
 
-def _with_first(first: str, lines: io.TextIOWrapper) -> Iterator[str]:
-    yield first
-    yield from lines
+def _separator(start: Sequence[str]) -> str:
+    """Return the sign that separates the names of a table; a comma if there is only one name.
+
+    If the names contain commas and another sign, the other sign separates them if the next row has as many of it, and
+    has not as many commas or if a blank follows each comma of the names, as in "height, cm".
+
+    Args:
+        start: the first lines of the table.
+
+    Raises:
+        ValueError: the names are in quotation marks, with blanks between them.
+    """
+    first = _first_record(start)
+    second = _first_record([line for line in start[len(first) :] if line.strip()])
+    header, row = "".join(first), "".join(second)
+    if re.fullmatch(r'"[^"]*"(?:[ ]+"[^"]*")+\s*', header):
+        raise ValueError(
+            "blanks separate the cells; set data.separator=space if the data set has that setting, or save the file "
+            "with commas"
+        )
+    header, row = (re.sub(r'"[^"]*"', "", record) for record in (header, row))
+    counts = {sign: header.count(sign) for sign in ",;\t|"}
+    likely = max(";\t|", key=counts.__getitem__)
+    if not counts[likely]:
+        return ","
+    as_many = row.count(likely) == counts[likely]
+    in_names = row.count(",") != counts[","] or header.count(", ") == counts[","]
+    return likely if not counts[","] or (as_many and in_names) else ","
 
 
-def _separator(first: str) -> str:
-    """Return the sign that separates the names in the first line of a table; a comma if there is only one name."""
-    outside = re.sub(r'"[^"]*"', "", first)
-    counts = {sign: outside.count(sign) for sign in ",;\t|"}
-    return "," if counts[","] or not any(counts.values()) else max(counts, key=counts.__getitem__)
+def _first_record(lines: Sequence[str]) -> Sequence[str]:
+    """Return the first line, and the following lines if a quoted cell goes on in them.
+
+    A quotation mark that none of the lines closes stands for itself.
+    """
+    marks = 0
+    for number, line in enumerate(lines, 1):
+        marks += line.count('"')
+        if marks % 2 == 0:
+            return lines[:number]
+    return lines[:1]
 
 
 def read_columns(
@@ -345,6 +380,8 @@ def _why_other_width(header: Sequence[str], cells: Sequence[str], writing: Writi
     """Return a possible reason why a row has another number of cells than the first line; "" if none is known."""
     if len(cells) > len(header) and sum(cell.strip().isdigit() for cell in cells) > len(header) // 2 + 1:
         return " If commas separate the cells, put numbers with a decimal comma in quotation marks."
+    if len(header) == 1 and len(cells) > 1:
+        return " If other lines, such as a title, stand above the names of the columns, remove these lines."
     return (
         " Or name the first column too: the rows may begin with row numbers that the first line does not name."
         if len(cells) == len(header) + 1
