@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Int
 from numpy.typing import NDArray
 
+from framework.datasets.class_names import compare_classes
 from framework.errors import DataError
 
 SPLITS = ("train", "validation", "test")
@@ -60,8 +61,8 @@ def list_files(root: Path, suffixes: Collection[str], fewest: int = 2) -> FileLi
     """Return the files of a user's folder that have one of the suffixes.
 
     Raises:
-        DataError: The folder is missing or has none of the layouts, a class has no files, or there are fewer than
-            `fewest` classes.
+        DataError: The folder is missing or has none of the layouts, a class has no files, there are fewer than
+            `fewest` classes, or the names of two classes look the same.
     """
     remedy = describe_layouts(suffixes)
     folders = subfolders(root, remedy)
@@ -98,6 +99,7 @@ def list_files(root: Path, suffixes: Collection[str], fewest: int = 2) -> FileLi
         splits = ("test", "train") if by_split else ("",)
         folders_of_class = [(path.name, split, path / split) for path in folders for split in splits]
     classes = sorted({name for name, _, _ in folders_of_class})
+    compare_classes(classes, f"data.root = {root}")
     if len(classes) < fewest:
         content = f"only the class {classes[0]}" if classes else "no folder"
         raise DataError(

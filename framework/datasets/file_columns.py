@@ -1,11 +1,12 @@
-"""The columns `file` and `split` of a CSV table that lists images."""
+"""The columns `file` and `split` of a user's CSV table."""
 
 import hashlib
 import posixpath
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Literal, cast
 
+from framework.datasets.class_folders import OTHER_NAMES
 from framework.datasets.csv_columns import Columns, Writing, read_columns
 from framework.errors import DataError, did_you_mean, quote, shorten
 from framework.storage.names import is_within
@@ -36,13 +37,39 @@ def read_file_columns(file: Path, writing: Writing | None, missing: str) -> Colu
     return table
 
 
+def refuse_other_split(table: Columns, but: Collection[str] = ()) -> None:
+    """Refuse a table without a column `split` in which another column seems to assign each row to a split.
+
+    Such a column would not be read, so that rows for the test could be used for training.
+
+    Args:
+        table: The table.
+        but: Columns that have another meaning.
+
+    Raises:
+        DataError: A column holds nothing but names of splits (`OTHER_NAMES`), of at least two splits.
+    """
+    if SPLIT in table.cells:
+        return
+    for name, cells in table.cells.items():
+        if name in but or cells[0].lower() not in OTHER_NAMES:
+            continue
+        splits = {OTHER_NAMES.get(cell.lower()) for cell in set(cells)}
+        if None not in splits and len(splits) > 1:
+            raise DataError(
+                f"{table.file}: The column {quote(name)} seems to assign each row to a split, but only a column named "
+                f"`{SPLIT}` does so. Name it `{SPLIT}` and write {', '.join(SPLITS)} into its cells, or remove it."
+            )
+
+
 def list_files(table: Columns) -> Iterator[tuple[str, Split | None]]:
     """Yield the file and the split of each row; the split is None if the table has no column of splits.
 
     Raises:
         DataError: A name of a file is missing, leads out of the folder or occurs twice, or a split is unknown; the
-            message names the line.
+            message names the line. Or the column of splits has another name.
     """
+    refuse_other_split(table)
     first_line: dict[str, int] = {}
     for index, (number, path) in enumerate(zip(table.lines, table.cells[FILE], strict=True)):
         # `./a.png` and `a.png` are the same image, which must be in one split only
@@ -66,9 +93,15 @@ def list_files(table: Columns) -> Iterator[tuple[str, Split | None]]:
         if word is not None and word not in SPLITS:
             raise DataError(
                 f"{table.file} line {number}, column `{SPLIT}`: {quote(word)} is not a split. Write one of "
-                f"{', '.join(SPLITS)}.{did_you_mean(word, SPLITS)}"
+                f"{', '.join(SPLITS)}.{suggest_split(word)}"
             )
         yield name, cast(Split | None, word)
+
+
+def suggest_split(word: str) -> str:
+    """Return ' Did you mean ...?' for a word that means a split; "" for other words."""
+    split = OTHER_NAMES.get(word.lower())
+    return f" Did you mean '{split}'?" if split else did_you_mean(word, SPLITS)
 
 
 def split_of(name: str) -> Split:

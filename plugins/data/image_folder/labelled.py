@@ -17,6 +17,7 @@ from torch import Tensor
 
 from framework.configuration.paths import Words
 from framework.datasets.class_folders import describe_layouts, list_files
+from framework.datasets.class_names import compare_classes
 from framework.datasets.csv_columns import MISSING
 from framework.datasets.fields import Fields
 from framework.datasets.file_columns import FILE, SPLIT, SPLITS, read_file_columns
@@ -141,7 +142,7 @@ class LabelledImages:
         return listed
 
     def _select(self, root: Path, listed: Listed) -> Listed:
-        """Return only the images of the chosen classes."""
+        """Return only the images of the chosen classes, with a remark about classes of similar names."""
         names = sorted(set(listed.labels))
         for name in self.classes or ():
             if name not in names:
@@ -151,7 +152,9 @@ class LabelledImages:
                 )
         wanted = names if self.classes is None else set(self.classes)
         kept = [index for index, label in enumerate(listed.labels) if label in wanted]
+        place = str(root if self.csv is None else root / self.csv)
         return listed._replace(
+            remarks=(*listed.remarks, *compare_classes(wanted, place)),
             names=[listed.names[index] for index in kept],
             labels=[listed.labels[index] for index in kept],
             splits=listed.splits[kept],

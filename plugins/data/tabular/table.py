@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from framework.data import Splits, as_inputs
 from framework.datasets.angles import unlike_degrees, unlike_radians
+from framework.datasets.class_names import compare_classes
 from framework.datasets.csv_columns import (
     ColumnChoice,
     Columns,
@@ -29,6 +30,7 @@ from framework.datasets.csv_columns import (
     tables,
 )
 from framework.datasets.fields import Fields
+from framework.datasets.file_columns import refuse_other_split, suggest_split
 from framework.distributions.circular import wrap
 from framework.errors import DataError, did_you_mean, quote, shorten
 from framework.storage import text
@@ -188,6 +190,8 @@ def load(
     cells = read_columns(file, writing or LabelledWriting())
     cells, question = (cells, question) if arrange is None else arrange(cells, question)
     require(cells, question.target, "data.target")
+    if question.test < 1:
+        refuse_other_split(cells, question.target)
     content = hashlib.sha256(repr(cells.cells).encode()).hexdigest()
     digest = hashlib.sha256(repr((content, question)).encode()).hexdigest()
     if trained is not None:
@@ -218,6 +222,8 @@ def load(
     scaling = scaling if trained is None else trained.scaling
     labels = () if trained is None else trained.labels
     target, encoded = _encode(cells, rows, fitted_rows, values, question, labels)
+    if target.kind == "class" and trained is None:
+        remarks += compare_classes(target.names, f"{file}, column {question.target[0]!r}")
     if target.kind == "real" and trained is None:
         remarks += _constant_targets(question.target, values[training])
     scaled = as_float32(cells, columns, rows, standardise(inputs[rows], scaling))
@@ -553,7 +559,7 @@ def _stated_splits(cells: Columns, rows: np.ndarray) -> Int[np.ndarray, "row"]:
         if word not in SPLITS:
             raise DataError(
                 f"{cells.file} line {cells.lines[row]}, column `{SPLIT}`: {word!r} is not a split. Write one of "
-                f"{', '.join(SPLITS)}.{did_you_mean(word, SPLITS)}"
+                f"{', '.join(SPLITS)}.{suggest_split(word)}"
             )
     return np.array([SPLITS.index(cells.cells[SPLIT][row]) for row in rows], dtype=np.int64)
 

@@ -138,6 +138,32 @@ def test_splits_and_groups_come_from_columns_of_these_names(tmp_path: Path) -> N
         assert fields_of(data, name)["group"].tolist() == expected
 
 
+@pytest.mark.parametrize("words", ["train,validation,test", "Train,Val,Test", "TRAINING,dev,eval"])
+@pytest.mark.parametrize("name", ["Split", "set", "usage"])
+def test_a_column_of_splits_with_another_name_is_refused(tmp_path: Path, name: str, words: str) -> None:
+    """Otherwise test rows would be used for training without notice, or be an input with data.words=levels."""
+    rows = "\n".join(f"{row},{row % 2},{words.split(',')[row % 3]}" for row in range(ROWS))
+    file = table(tmp_path, f"number,class,{name}\n{rows}")
+    for settings_of_words in ({}, {"words": "levels"}):
+        with pytest.raises(
+            DataError, match=rf"mine\.csv: The column '{name}' seems to assign each row to a split"
+        ):
+            prepare_data(file, **settings_of_words)
+    prepare_data(table(tmp_path, f"number,class,{name}\n" + rows.replace(words.split(",")[1], "other")))
+
+
+def test_classes_of_similar_names_are_refused_or_reported(tmp_path: Path) -> None:
+    def write(*labels: str) -> Path:
+        rows = "\n".join(f"{row},{labels[row % len(labels)]}" for row in range(ROWS))
+        return table(tmp_path, f"number,class\n{rows}")
+
+    assert any(
+        "'No' and 'no' differ only" in remark for remark in prepare_data(write("no", "yes", "No")).remarks
+    )
+    with pytest.raises(DataError, match=r"mine\.csv, column 'class': The classes .* look the same"):
+        prepare_data(write("café", "cafe\u0301"))
+
+
 def test_labels_are_ordered_by_size_where_they_are_numbers(tmp_path: Path) -> None:
     text = "x,class\n" + "\n".join(f"{row},{(10, 2, -1)[row % 3]}" for row in range(60))
     data = prepare_data(table(tmp_path, text))

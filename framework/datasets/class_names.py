@@ -1,0 +1,49 @@
+"""Names of the classes in a user's data: two names that look the same are refused, and similar ones are reported."""
+
+import unicodedata
+from collections.abc import Callable, Iterable
+
+from framework.errors import DataError, quote, shorten
+from framework.storage.text import INVISIBLE
+
+
+def compare_classes(names: Iterable[str], place: str) -> tuple[str, ...]:
+    """Return a remark about classes whose names differ only in capital letters; () if there are none.
+
+    Args:
+        names: names of the classes.
+        place: the file, column or folder that names them, for the message.
+
+    Raises:
+        DataError: two names look the same, but consist of different characters: of composed and decomposed letters,
+            invisible characters, or other blanks. They would be two classes.
+    """
+    different = sorted(set(names))
+    alike = _first_equal(different, _as_seen)
+    if alike:
+        raise DataError(
+            f"{place}: The classes {alike[0]!a} and {alike[1]!a} look the same ({quote(_as_seen(alike[0]))}), but "
+            "their characters differ, so they would be two classes. Write the name in the same way everywhere."
+        )
+    similar = _first_equal(different, str.casefold)
+    if not similar:
+        return ()
+    return (
+        f"the classes {shorten(' and '.join(map(quote, similar)))} differ only in capital letters and are different "
+        "classes; write them in the same way to make them one class",
+    )
+
+
+def _as_seen(name: str) -> str:
+    """Return a name with composed letters (NFC), single blanks and no invisible characters."""
+    composed = unicodedata.normalize("NFC", name)
+    return " ".join("".join(letter for letter in composed if letter not in INVISIBLE).split())
+
+
+def _first_equal(names: Iterable[str], key: Callable[[str], str]) -> tuple[str, str] | None:
+    """Return the first two names for which `key` returns the same; None if there are none."""
+    first: dict[str, str] = {}
+    for name in names:
+        if first.setdefault(key(name), name) != name:
+            return first[key(name)], name
+    return None
