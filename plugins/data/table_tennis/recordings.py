@@ -125,10 +125,15 @@ def _from_matlab(file: Path) -> list[Flight]:
     variables = read_variables(file)
     training: Any = variables.get("ballTrain")
     if isinstance(training, Mapping) and "data" in training:
-        tables = [to_real(cell, "a flight") for cell in np.atleast_1d(training["data"])]
+        tables = [to_real(cell, "a flight") for cell in _split_cells(training["data"])]
     elif "time" in variables and "ball" in variables:
-        pairs = zip(np.atleast_1d(variables["time"]), np.atleast_1d(variables["ball"]), strict=False)
-        tables = [_join(time, ball) for time, ball in pairs]
+        times, balls = _split_cells(variables["time"]), _split_cells(variables["ball"])
+        if len(times) != len(balls):
+            raise DataError(
+                f"{file}: The variable `time` holds {len(times)} flights and `ball` holds {len(balls)}. "
+                "Give both one cell for each flight."
+            )
+        tables = [_join(time, ball) for time, ball in zip(times, balls, strict=True)]
     else:
         raise DataError(
             f"{file} holds {shorten(', '.join(variables)) or 'nothing'}, but the variable `ballTrain` with a "
@@ -144,6 +149,12 @@ def _from_matlab(file: Path) -> list[Flight]:
     return [
         Flight(f"{file} flight {number}", table[:, 0], table[:, 1:]) for number, table in enumerate(tables)
     ]
+
+
+def _split_cells(variable: Any) -> list[Any]:
+    """Return the cells of a variable; an array of numbers is the only cell, as the reader drops axes of length 1."""
+    array = np.asarray(variable)
+    return list(array.reshape(-1)) if array.dtype == object else [array]
 
 
 def _join(time: Any, ball: Any) -> np.ndarray:

@@ -1,15 +1,17 @@
 """Tests of flights from files and from the simulator, their windows, and what is refused."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from framework.configuration.schema import build, resolve
 from framework.errors import DataError
-from plugins.data.table_tennis.recordings import Flight
+from plugins.data.table_tennis.recordings import Flight, flights_of
 from plugins.data.table_tennis.rows import table, write_csv
 from plugins.data.table_tennis.windows import Grid, is_no_outlier, prefix, windows
 
@@ -134,6 +136,36 @@ def test_the_laboratorys_flights_are_82_and_none_is_in_two_splits() -> None:
     flights = [set(split.fields["flight"].tolist()) for split in data.splits()]
     assert sum(map(len, flights)) + int(fingerprint["too short"]) == 82
     assert not (flights[0] & flights[1] or flights[0] & flights[2] or flights[1] & flights[2])
+
+
+def _as_cells(arrays: Sequence[np.ndarray]) -> np.ndarray:
+    cells = np.empty(len(arrays), object)
+    cells[:] = arrays
+    return cells
+
+
+@pytest.mark.parametrize("frames", [[50], [50, 50], [50, 40]], ids=str)
+@pytest.mark.parametrize("layout", ["ballTrain", "time and ball"])
+def test_a_matlab_file_holds_any_number_of_flights(
+    tmp_path: Path, layout: str, frames: Sequence[int]
+) -> None:
+    tables = [table(number, count) for number, count in enumerate(frames)]
+    times, balls = [rows[:, 0] for rows in tables], [rows[:, 1:] for rows in tables]
+    together = {"time": _as_cells(times), "ball": _as_cells(balls)}
+    savemat(
+        tmp_path / "flights.mat",
+        {"ballTrain": {"data": _as_cells(tables)}} if layout == "ballTrain" else together,
+    )
+    flights = flights_of(tmp_path / "flights.mat", 0.016)
+    for flight, rows in zip(flights, tables, strict=True):
+        np.testing.assert_array_equal(np.column_stack([flight.times, flight.places]), rows)
+
+
+def test_a_matlab_file_with_more_times_than_positions_is_refused(tmp_path: Path) -> None:
+    rows = table(0, 50)
+    savemat(tmp_path / "flights.mat", {"time": _as_cells([rows[:, 0]] * 2), "ball": _as_cells([rows[:, 1:]])})
+    with pytest.raises(DataError, match=r"`time` holds 2 flights and `ball` holds 1\. Give both one cell"):
+        flights_of(tmp_path / "flights.mat", 0.016)
 
 
 def test_noise_constants_and_stiff_contact_change_the_simulated_flights() -> None:
