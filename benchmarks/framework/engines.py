@@ -120,7 +120,7 @@ def memory_of_tree(root: int) -> float:
         with suppress(OSError):
             lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
             total += sum(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
-    return total / 1024
+    return total * 1024 / 1e6
 
 
 def installed_megabytes(package: str) -> float:
