@@ -94,8 +94,7 @@ def loft(rings: Points, edges: Edges = "shared", caps: bool = True) -> Solid:
         return Solid(stack.reshape(-1, 3), faces)
     side = stack
     if edges == "sharp":
-        after = np.roll(stack, -1, axis=1)
-        side = np.stack([stack[:-1], after[:-1], after[1:], stack[1:]], axis=2)
+        side = stack.reshape(-1, 3)[quad_corners(layers, points)[:-1]]
     return Solid(np.concatenate([side.reshape(-1, 3), stack[0], stack[-1]]), faces)
 
 

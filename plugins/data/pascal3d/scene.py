@@ -136,7 +136,8 @@ def render_object(
     left, top, right, bottom = edges
     x0, x1 = max(0, math.floor(left)), min(width, math.ceil(right) + 1)
     y0, y1 = max(0, math.floor(top)), min(height, math.ceil(bottom) + 1)
-    layer = Layer(np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32))
+    planes = np.zeros((3, height, width), np.float32)
+    layer = Layer(np.moveaxis(planes, 0, 2), np.zeros((height, width), np.float32))
     if x0 >= x1 or y0 >= y1:
         return layer
     scene = Scene(
@@ -146,15 +147,15 @@ def render_object(
         camera=crop_camera(camera, (x0, y0), (y1 - y0, x1 - x0), SUPERSAMPLING),
     )
     channels = renderer(scene, ("color", "mask"))
-    layer.color[y0:y1, x0:x1] = _average_blocks(channels["color"].cpu().numpy())
+    planes[:, y0:y1, x0:x1] = _average_blocks(channels["color"].movedim(2, 0).contiguous().cpu().numpy())
     layer.opacity[y0:y1, x0:x1] = _average_blocks(channels["mask"].cpu().numpy().astype(np.float32))
     return layer
 
 
 def _average_blocks(fine: FloatImage) -> FloatImage:
-    """Return the mean of every block of SUPERSAMPLING × SUPERSAMPLING pixels."""
+    """Return the mean of every block of SUPERSAMPLING × SUPERSAMPLING pixels of an image (…, height, width)."""
     step = range(SUPERSAMPLING)
-    total = sum(fine[row::SUPERSAMPLING, column::SUPERSAMPLING] for row in step for column in step)
+    total = sum(fine[..., row::SUPERSAMPLING, column::SUPERSAMPLING] for row in step for column in step)
     return np.asarray(total / np.float32(SUPERSAMPLING**2))
 
 

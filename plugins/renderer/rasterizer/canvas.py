@@ -51,7 +51,7 @@ class Corners:
 
     def __init__(self, indices: np.ndarray) -> None:
         self.array = indices.astype(np.int32)
-        self.largest = int(raster.largest_index(indices.reshape(-1).view(f"u{indices.itemsize}")))
+        self.largest = int(indices.reshape(-1).view(f"u{indices.itemsize}").max(initial=0))
 
     @cached_property
     def adjacent(self) -> np.ndarray:

@@ -50,19 +50,6 @@ compiled = compiler(KEPT_IN)
 
 @compiled
 @no_type_check
-def largest_index(indices):
-    """Return the largest of the unsigned integers `indices`.
-
-    The caller reads signed indices as unsigned integers with the same bits, so that a negative index is very large.
-    """
-    largest = indices.dtype.type(0)
-    for index in indices:
-        largest = max(largest, index)
-    return largest
-
-
-@compiled
-@no_type_check
 def is_out_of_view(vertices, rotation, translation, focal, principal, near, height, width):
     """Return whether the bounding box of all vertices lies completely outside one plane of the view frustum.
 
