@@ -21,7 +21,7 @@ OTHER_NAMES = {
     **dict.fromkeys(("val", "valid", "dev", "validate"), "validation"),
     **dict.fromkeys(("testing", "testset", "test_set", "eval"), "test"),
 }
-"""Names, in small letters, that other programs give to the folders of splits, and the names that are read here."""
+"""Names of splits in this and other programs, in small letters; each maps to the name of the split in `SPLITS`."""
 
 
 def describe_layouts(suffixes: Iterable[str]) -> str:

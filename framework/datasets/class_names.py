@@ -15,8 +15,8 @@ def compare_classes(names: Iterable[str], place: str) -> tuple[str, ...]:
         place: the file, column or folder that names them, for the message.
 
     Raises:
-        DataError: two names look the same, but consist of different characters: of composed and decomposed letters,
-            invisible characters, or other blanks. They would be two classes.
+        DataError: two names look the same, but differ in composed and decomposed letters, in invisible characters or in
+            blanks, so that they would be two classes.
     """
     different = sorted(set(names))
     alike = _first_equal(different, _as_seen)

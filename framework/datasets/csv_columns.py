@@ -274,8 +274,9 @@ def _rows(lines: io.TextIOWrapper, writing: Writing) -> Any:
 def _separator(start: Sequence[str]) -> str:
     """Return the sign that separates the names of a table; a comma if there is only one name.
 
-    If the names contain commas and another sign, the other sign separates them if the next row has as many of it, and
-    has not as many commas or if a blank follows each comma of the names, as in "height, cm".
+    If the line of names contains commas and another sign, the other sign separates the names under two conditions: the
+    next row contains this sign as often as the names do; and the next row contains another number of commas than the
+    names, or a blank follows each comma of the names, as in "height, cm".
 
     Args:
         start: the first lines of the table.

@@ -67,7 +67,7 @@ def list_files(table: Columns) -> Iterator[tuple[str, Split | None]]:
 
     Raises:
         DataError: A name of a file is missing, leads out of the folder or occurs twice, or a split is unknown; the
-            message names the line. Or the column of splits has another name.
+            message then names the line. The error is also raised if the column of splits has another name.
     """
     refuse_other_split(table)
     first_line: dict[str, int] = {}

@@ -152,7 +152,7 @@ def _from_matlab(file: Path) -> list[Flight]:
 
 
 def _split_cells(variable: Any) -> list[Any]:
-    """Return the cells of a variable; an array of numbers is the only cell, as the reader drops axes of length 1."""
+    """Return the cells of a variable; an array of numbers is one cell, because the reader drops axes of length 1."""
     array = np.asarray(variable)
     return list(array.reshape(-1)) if array.dtype == object else [array]
 
