@@ -57,8 +57,16 @@ class FileList(NamedTuple):
         return self._replace(files=files, labels=self.labels[chosen], splits=self.splits[chosen])
 
 
-def list_files(root: Path, suffixes: Collection[str], fewest: int = 2) -> FileList:
+def list_files(
+    root: Path, suffixes: Collection[str], fewest: int = 2, *, test_only: bool = False
+) -> FileList:
     """Return the files of a user's folder that have one of the suffixes.
+
+    Args:
+        root: The folder.
+        suffixes: Suffixes of the files, in small letters.
+        fewest: Smallest number of classes.
+        test_only: Whether files of the test split suffice, because the model is trained already.
 
     Raises:
         DataError: The folder is missing or has none of the layouts, a class has no files, there are fewer than
@@ -68,16 +76,18 @@ def list_files(root: Path, suffixes: Collection[str], fewest: int = 2) -> FileLi
     folders = subfolders(root, remedy)
     names = {path.name for path in folders}
     if {"train", "test"} & names:
-        unexpected, missing = sorted(names - set(SPLITS)), sorted({"train", "test"} - names)
+        needed = {"test"} if test_only else {"train", "test"}
+        unexpected, missing = sorted(names - set(SPLITS)), sorted(needed - names)
         if unexpected or missing:
+            optional = "only test must be there" if test_only else "only validation may be missing"
             fault = (
                 f"holds a folder {unexpected[0]} beside folders of splits"
                 if unexpected
                 else f"holds no folder {missing[0]}"
             )
             raise DataError(
-                f"data.root = {root} {fault}. The folders of splits are {', '.join(SPLITS)}; only validation may be "
-                f"missing.{_suggest_split(unexpected)} {remedy}"
+                f"data.root = {root} {fault}. The folders of splits are {', '.join(SPLITS)}; {optional}."
+                f"{_suggest_split(unexpected)} {remedy}"
             )
         folders_of_class = [
             (inner.name, split.name, inner) for split in folders for inner in subfolders(split, remedy)

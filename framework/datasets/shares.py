@@ -53,12 +53,12 @@ def hold_out(
 
 
 def check_shares(validation: float, test: float) -> None:
-    """Check that shares for validation and test leave samples for training.
+    """Check that shares for validation and test leave samples for training, unless `test` is 1 (all files are tested).
 
     Raises:
         DataError: The sum of the shares is 1 or more.
     """
-    if validation + test >= 1:
+    if test < 1 <= validation + test:
         raise DataError(
             f"data.validation + data.test = {validation + test:g}, but the sum must be less than 1 to leave files "
             "for training. Reduce one of them."

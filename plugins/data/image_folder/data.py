@@ -17,6 +17,7 @@ from framework.configuration.paths import FilePath
 from framework.data import Batch, Data, Splits
 from framework.datasets import given_images, images
 from framework.datasets.fields import FetchedInBatches, fetch
+from framework.datasets.new_files import Trained, restore_trained
 from framework.errors import ConfigError
 from framework.target import Target
 from plugins.data.image_folder.corruption import Corrupted, Corruption
@@ -41,12 +42,16 @@ class LabelledData(Data):
     synthetic = False
     fewest: ClassVar[int] = 2
     """Smallest number of classes."""
+    predicts_classes: ClassVar[bool] = True
+    """True if the target is the class of an image."""
 
     def __init__(self, root: str | None, labelled: LabelledImages, jitter: float) -> None:
         self.root = root
         self.labelled = labelled
         self.jitter = jitter
         self.input_shape = labelled.input_shape
+        self._trained: Trained | None = None
+        self._own = Trained()
 
     _splits: Splits
 
@@ -55,7 +60,14 @@ class LabelledData(Data):
         self.title = find_folder(self.root).resolve().name
         self.skipped, self.remarks = loaded.skipped, loaded.remarks
         self._digest = loaded.digest
+        self._own = Trained(loaded.content, loaded.classes if self.predicts_classes else ())
         self._sizes = {split: str(len(table)) for split, table in loaded.splits.items()}
+
+    def state_dict(self) -> Mapping[str, Any]:
+        return (self._trained or self._own).state()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self._trained = restore_trained(state, type(self).__name__)
 
     def check_files(self) -> None:
         self.labelled.list_images(find_folder(self.root), self.fewest)
@@ -129,6 +141,7 @@ class ImageFolder(LabelledData):
             find_folder(self.root),
             lambda labels, split: {"target": labels, "group": torch.zeros_like(labels)},
             self.fewest,
+            self._trained,
         )
         self._keep(loaded)
         self.target = Target("class", loaded.classes)
@@ -169,6 +182,7 @@ class TurnedImages(LabelledData):
     """
 
     fewest = 1
+    predicts_classes = False
 
     def __init__(
         self, *, root: FilePath | None = None, labelled: LabelledImages, jitter: Jitter = 0.0
@@ -176,7 +190,7 @@ class TurnedImages(LabelledData):
         super().__init__(root, labelled, jitter)
 
     def prepare(self) -> None:
-        loaded = self.labelled.load(find_folder(self.root), self._choose_angles, self.fewest)
+        loaded = self.labelled.load(find_folder(self.root), self._choose_angles, self.fewest, self._trained)
         self._keep(loaded)
         self.target = Target("angle", ("turn",))
         self.groups = loaded.classes

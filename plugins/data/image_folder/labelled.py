@@ -23,6 +23,14 @@ from framework.datasets.fields import Fields
 from framework.datasets.file_columns import FILE, SPLIT, SPLITS, read_file_columns
 from framework.datasets.file_columns import list_files as list_rows
 from framework.datasets.images import MODES, SUFFIXES, Crop, Crops, cut_square, load_splits
+from framework.datasets.new_files import (
+    TestShare,
+    Trained,
+    are_all_for_test,
+    describe_tested_share,
+    hash_files,
+    index_labels,
+)
 from framework.datasets.shares import check_shares, choose_splits
 from framework.errors import DataError, did_you_mean, quote, shorten
 from plugins.data.image_folder.idx import Pair, find_pairs, read_pair
@@ -64,6 +72,7 @@ class Loaded(NamedTuple):
         skipped: Number of images that cannot be read.
         remarks: Clauses about files and columns that are not read.
         digest: Hash of names, classes, splits and, for idx files, pixels.
+        content: Hash of the images, whatever their splits (`framework.datasets.new_files`).
     """
 
     classes: tuple[str, ...]
@@ -71,6 +80,7 @@ class Loaded(NamedTuple):
     skipped: int
     remarks: tuple[str, ...]
     digest: str
+    content: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +94,7 @@ class LabelledImages:
         validation: Share of the images for validation, equal in every class, if no folder or column states which images
             are for validation.
         test: Share of the images for the test, equal in every class, if no folder, file or column states which images
-            are for the test.
+            are for the test; 1 makes all images test images, for a model that was trained on other images.
         data_seed: Seed of the splits, independent of the seed of the run.
         image_size: Side of the square inputs, pixels.
         grayscale: Whether images are read in grey.
@@ -94,7 +104,7 @@ class LabelledImages:
     csv: str | None = None
     classes: list[Words] | None = None
     validation: Share = 0.15
-    test: Share = 0.15
+    test: TestShare = 0.15
     data_seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     image_size: Annotated[int, Field(ge=8, le=1024)] = 48
     grayscale: bool = False
@@ -104,8 +114,10 @@ class LabelledImages:
     def input_shape(self) -> tuple[int, int, int]:
         return (1 if self.grayscale else 3, self.image_size, self.image_size)
 
-    def list_images(self, root: Path, fewest: int) -> Listed:
+    def list_images(self, root: Path, fewest: int, *, test_only: bool = False) -> Listed:
         """Return the chosen images of a folder, of at least `fewest` classes, with their classes and splits.
+
+        With `test_only`, images of the test split suffice.
 
         Raises:
             DataError: The table or an idx file is missing or damaged, the folder has another layout, a class is
@@ -118,7 +130,7 @@ class LabelledImages:
             listed = _list_idx(pairs)
         else:
             try:
-                files = list_files(root, SUFFIXES, fewest)
+                files = list_files(root, SUFFIXES, fewest, test_only=test_only)
             except DataError as error:
                 tables = sorted(path.name for path in root.glob("*.csv")) if root.is_dir() else []
                 if not tables:
@@ -161,26 +173,33 @@ class LabelledImages:
             pixels=None if listed.pixels is None else [listed.pixels[index] for index in kept],
         )
 
-    def load(self, root: Path, make_fields: MakeFields, fewest: int) -> Loaded:
+    def load(
+        self, root: Path, make_fields: MakeFields, fewest: int, trained: Trained | None = None
+    ) -> Loaded:
         """Read the images and return them in three splits.
 
         Args:
             root: Folder of the images.
             make_fields: Function that returns further fields of a split from the classes of its samples and its name.
             fewest: Smallest number of classes.
+            trained: What a trained model stores about its images; None without one. A trained model needs no images of
+                other splits than the test split, and not all of its classes.
 
         Raises:
             DataError: An image cannot be read and `unreadable` is "error", a split is empty, a class has no training
-                image, or there are fewer classes than `fewest`.
+                image, there are fewer classes than `fewest`, or the trained model does not know a class.
         """
-        listed = self.list_images(root, fewest)
-        classes = tuple(sorted(set(listed.labels)))
-        number = {name: index for index, name in enumerate(classes)}
-        labels = np.array([number[label] for label in listed.labels])
+        listed = self.list_images(root, fewest if trained is None else 1, test_only=trained is not None)
+        classes, labels = index_labels(listed.labels, trained, root)
+        content = _hash(root, listed)
         random = np.random.default_rng(self.data_seed)
-        splits = choose_splits(listed.splits, labels, self.validation, self.test, random)
+        if are_all_for_test(listed.splits, self.test, trained, content, root):
+            splits = np.full(len(labels), "test")
+        else:
+            splits = choose_splits(listed.splits, labels, self.validation, self.test, random)
+        remarks = describe_tested_share(listed.splits, splits, trained, content, root)
         indices = {split: np.flatnonzero(splits == split) for split in SPLITS}
-        self._check_splits(root, classes, labels, indices)
+        self._check_splits(root, classes, labels, indices, trained)
         fields = {
             split: make_fields(torch.from_numpy(labels[chosen]), split) for split, chosen in indices.items()
         }
@@ -199,22 +218,28 @@ class LabelledImages:
         else:
             tables = {}
             for split, chosen in indices.items():
-                squares = torch.stack([self._square(listed.pixels[index]) for index in chosen])
+                squares = torch.empty((len(chosen), *self.input_shape), dtype=torch.uint8)
+                for row, index in enumerate(chosen):
+                    squares[row] = self._square(listed.pixels[index])
                 tables[split] = Fields(input=squares, **fields[split], index=torch.arange(len(chosen)))
                 digest.update(squares.numpy().tobytes())
         digest.update(repr((listed.names, listed.labels, splits.tolist())).encode())
-        return Loaded(classes, tables, skipped, listed.remarks, digest.hexdigest())
+        return Loaded(classes, tables, skipped, (*listed.remarks, *remarks), digest.hexdigest(), content)
 
     @staticmethod
     def _check_splits(
-        root: Path, classes: Sequence[str], labels: NDArray, indices: Mapping[str, NDArray]
+        root: Path,
+        classes: Sequence[str],
+        labels: NDArray,
+        indices: Mapping[str, NDArray],
+        trained: Trained | None,
     ) -> None:
         for split, chosen in indices.items():
-            if not len(chosen):
+            if not len(chosen) and (trained is None or split == "test"):
                 remedy = "Add images." if split == "train" else f"Add images, or increase data.{split}."
                 raise DataError(f"{root}: The {split} split is empty ({len(labels)} images in all). {remedy}")
         missing = set(range(len(classes))) - set(labels[indices["train"]].tolist())
-        if missing:
+        if missing and trained is None:
             raise DataError(
                 f"{root}: The class {quote(classes[min(missing)])} has no training image, but every class needs one. "
                 "Add images."
@@ -231,6 +256,16 @@ class LabelledImages:
         square = cut_square(image, (0.0, 0.0, float(image.width), float(image.height)), 0.0, side)
         assert square is not None  # `read_pair` refuses images without pixels
         return torch.from_numpy(square)
+
+
+def _hash(root: Path, listed: Listed) -> str:
+    """Return a hash of images and labels, without splits."""
+    if listed.pixels is None:
+        return hash_files(root, listed.names, listed.labels)
+    digest = hashlib.sha256(repr(listed.labels).encode())
+    for pixels in listed.pixels:
+        digest.update(pixels.tobytes())
+    return digest.hexdigest()
 
 
 def find_folder(root: str | None) -> Path:

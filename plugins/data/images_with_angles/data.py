@@ -16,6 +16,13 @@ from framework.datasets import given_images, images
 from framework.datasets.csv_columns import Writing
 from framework.datasets.file_columns import SPLITS
 from framework.datasets.images import Crop
+from framework.datasets.new_files import (
+    Trained,
+    are_all_for_test,
+    describe_tested_share,
+    hash_files,
+    restore_trained,
+)
 from framework.errors import DataError, did_you_mean
 from framework.storage.names import spell_name
 from framework.target import Target
@@ -35,6 +42,8 @@ class ImagesWithAngles(Data):
         mirror: Angles that change sign in a mirror image; if it names any, half of the training images are mirrored.
         jitter: Largest share by which training images are shifted, scaled and made brighter or darker.
         skip_unreadable: Whether images that cannot be read are left out and counted; otherwise they are an error.
+        test: 1 makes all images test images, for a model that was trained on other images; None: a column `split` of
+            the table, or a hash of the names, states which images are for the test.
         writing: Notation of the table: separator, decimal sign and the like.
     """
 
@@ -55,6 +64,7 @@ class ImagesWithAngles(Data):
         mirror: list[Words] | None = None,
         jitter: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = 0.08,
         skip_unreadable: bool = False,
+        test: Literal[1] | None = None,
         writing: Writing,
     ) -> None:
         self.root = root
@@ -67,6 +77,9 @@ class ImagesWithAngles(Data):
         self.jitter = jitter
         self.varies = bool(mirror) or jitter > 0
         self.skip_unreadable = skip_unreadable
+        self.test: Literal[1] | None = test
+        self._trained: Trained | None = None
+        self._own = Trained()
         self.writing = writing
 
     def prepare(self) -> None:
@@ -83,6 +96,7 @@ class ImagesWithAngles(Data):
         self.groups = (spell_name(root.resolve().name),)
         self.synthetic = False
         self._signs = [-1.0 if name in self.mirror else 1.0 for name in table.columns] if self.mirror else []
+        table = self._choose_test_rows(root, table)
         self._digest = hashlib.sha256(repr((table.columns, table.rows)).encode()).hexdigest()
         chosen = {split: [row for row in table.rows if row.split == split] for split in SPLITS}
         self._tables, self.skipped = images.load_splits(
@@ -94,11 +108,28 @@ class ImagesWithAngles(Data):
             skip_unreadable=self.skip_unreadable,
         )
         for split, samples in self._tables.items():
-            if len(samples) == 0:
+            if len(samples) == 0 and (self._trained is None or split == "test"):
                 raise DataError(
                     f"The {split} split is empty ({len(table.rows)} images in all, {self.skipped} unreadable). Add "
                     f"images, or assign each image to {', '.join(SPLITS)} in a column `split` of the table."
                 )
+
+    def _choose_test_rows(self, root: Path, table: Table) -> Table:
+        """Return the table with all rows in the test split if `test` is 1, and note its content."""
+        content = hash_files(root, [row.file for row in table.rows], [row.angles for row in table.rows])
+        self._own = Trained(content)
+        chosen = np.array([row.split for row in table.rows])
+        stated = chosen if table.states_splits else np.full(len(chosen), "")
+        if are_all_for_test(stated, self.test or 0, self._trained, content, root):
+            return table._replace(rows=[row._replace(split="test") for row in table.rows])
+        self.remarks += describe_tested_share(stated, chosen, self._trained, content, root)
+        return table
+
+    def state_dict(self) -> Mapping[str, Any]:
+        return (self._trained or self._own).state()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self._trained = restore_trained(state, type(self).__name__)
 
     def _labels(self) -> tuple[Path, Table]:
         """Return the folder of the images, and the table of angles in it."""

@@ -36,11 +36,13 @@ class Table(NamedTuple):
         columns: Names of the angles.
         rows: Rows of the table, one for each image.
         remarks: Clauses about columns that were left out.
+        states_splits: Whether a column states the split of each image.
     """
 
     columns: tuple[str, ...]
     rows: list[Row]
     remarks: tuple[str, ...] = ()
+    states_splits: bool = False
 
 
 def read_table(
@@ -74,7 +76,7 @@ def read_table(
         )
         for index, (name, split) in enumerate(list_files(table))
     ]
-    return Table(chosen.names, rows, describe_choice(chosen))
+    return Table(chosen.names, rows, describe_choice(chosen), SPLIT in table.cells)
 
 
 def _angle_columns(table: Columns, requested: Sequence[str] | None) -> ColumnChoice:

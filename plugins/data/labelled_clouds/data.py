@@ -1,8 +1,9 @@
 """Data sets ModelNet40, a user's own folders, and DALES; framework.data describes the contract."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -10,11 +11,20 @@ from pydantic import Field
 
 from framework.configuration.paths import FilePath, Words
 from framework.datasets.class_folders import describe_layouts, list_files
+from framework.datasets.new_files import (
+    TestShare,
+    Trained,
+    are_all_for_test,
+    describe_tested_share,
+    index_labels,
+    restore_trained,
+)
 from framework.datasets.shares import assign_folds, check_shares, choose_splits, hold_out
 from framework.errors import DataError
 from framework.geometry.mesh_files import NORMALS, XYZ
 from framework.geometry.meshes import READERS, stream
 from framework.storage.generated import read_mark
+from framework.storage.names import spell_name
 from plugins.data.labelled_clouds import folders
 from plugins.data.labelled_clouds.archive import read_archive
 from plugins.data.labelled_clouds.labelled_clouds import (
@@ -107,7 +117,7 @@ class ModelNet40(LabelledClouds):
                 "rotations": str(self.rotations),
                 "points": f"{self.reading.points}, seed {self.reading.seed}",
             },
-            classes=readable.classes,
+            classes=tuple(map(spell_name, readable.classes)),
             packed=packed,
             labels=readable.labels,
             names=[file.name for file in readable.files],
@@ -133,7 +143,8 @@ class PointCloudFolder(LabelledClouds):
             of its faces.
         validation: Share of the files for validation, equal in every class, if there are no folders of that split. With
             0 the training split is also used for validation: early stopping and calibration then use training data.
-        test: Share of the files for the test, equal in every class, if there are no folders of that split.
+        test: Share of the files for the test, equal in every class, if there are no folders of that split; 1 makes all
+            files test files, for a model that was trained on other files.
         centred: Whether to subtract each cloud's mean in float64 before the cloud is rounded to float32; map
             coordinates need this.
         unreadable: Treatment of files that cannot be read. "error" refuses them, "skip" leaves them out.
@@ -150,7 +161,7 @@ class PointCloudFolder(LabelledClouds):
         points: Annotated[int, Field(ge=1, le=100_000_000)] | None = None,
         columns: list[Words] | None = None,
         validation: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.15,
-        test: Share = 0.15,
+        test: TestShare = 0.15,
         centred: bool = False,
         unreadable: Unreadable = "error",
         data_seed: Seed = 0,
@@ -161,6 +172,14 @@ class PointCloudFolder(LabelledClouds):
         self.columns = self.reading.all_columns
         self.unreadable: Unreadable = unreadable
         self.shares = (validation, test)
+        self._trained: Trained | None = None
+        self._own = Trained()
+
+    def state_dict(self) -> Mapping[str, Any]:
+        return (self._trained or self._own).state()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self._trained = restore_trained(state, type(self).__name__)
 
     def load_clouds(self) -> CloudSet:
         if self.root is None:
@@ -168,17 +187,24 @@ class PointCloudFolder(LabelledClouds):
         check_shares(*self.shares)
         root = Path(self.root).expanduser()
         self.title = root.resolve().name
-        listed = list_files(root, READERS)
+        trained = self._trained
+        listed = list_files(root, READERS, 2 if trained is None else 1, test_only=trained is not None)
         readable, packed = load_listed(listed, root, self.reading, "point_cloud_folder", self.unreadable)
-        splits = choose_splits(
-            readable.splits, readable.labels, *self.shares, stream(self.reading.seed, "splits")
-        )
-        missing = set(range(len(readable.classes))) - set(readable.labels[splits == "train"].tolist())
-        if missing and "train" in splits:
+        content = packed.digest()
+        names = [spell_name(readable.classes[label]) for label in readable.labels]
+        classes, labels = index_labels(names, trained, root)
+        if are_all_for_test(readable.splits, self.shares[1], trained, content, root):
+            splits = np.full(len(labels), "test")
+        else:
+            random = stream(self.reading.seed, "splits")
+            splits = choose_splits(readable.splits, labels, *self.shares, random)
+        missing = set(range(len(classes))) - set(labels[splits == "train"].tolist())
+        if missing and "train" in splits and trained is None:
             raise DataError(
-                f"{root}: The class {readable.classes[min(missing)]} has no training sample, but every class "
-                "needs one. Add files."
+                f"{root}: The class {classes[min(missing)]} has no training sample, but every class needs one. Add "
+                "files."
             )
+        self._own = Trained(content, classes)
         return CloudSet(
             source=str(root),
             description={
@@ -188,14 +214,18 @@ class PointCloudFolder(LabelledClouds):
                 "points": f"{self.reading.points}, seed {self.reading.seed}",
                 "ignored": str(readable.ignored),
             },
-            classes=readable.classes,
+            classes=classes,
             packed=packed,
-            labels=readable.labels,
+            labels=labels,
             names=[file.relative_to(root).as_posix() for file in readable.files],
             splits=splits,
             skipped=len(listed.files) - len(readable.files),
             validated_on="validation" if self.shares[0] or "validation" in splits else "train",
-            remarks=describe_unread(readable, self.reading),
+            remarks=(
+                *describe_unread(readable, self.reading),
+                *describe_tested_share(readable.splits, splits, trained, content, root),
+            ),
+            needed=("train", "validation", "test") if trained is None else ("test",),
         )
 
 
@@ -249,7 +279,7 @@ class Dales(LabelledClouds):
                 "fold": f"{self.fold} of {FOLDS}, seed {seed}",
                 "points": str(self.reading.points or "all"),
             },
-            classes=archive.classes,
+            classes=tuple(map(spell_name, archive.classes)),
             packed=Packed.of(clouds, 3),
             labels=archive.label,
             names=[str(number) for number in archive.identity],

@@ -2,7 +2,7 @@
 
 import hashlib
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -19,7 +19,7 @@ from framework.datasets.class_folders import FileList
 from framework.errors import DataError, shorten
 from framework.geometry import meshes
 from framework.geometry.meshes import READERS
-from framework.storage.names import as_bytes, spell_name
+from framework.storage.names import as_bytes
 from framework.target import Target
 from plugins.data.labelled_clouds.reading import Clouds, Packed, Reading, load_files, load_unlabelled
 from plugins.data.labelled_clouds.rotated import Rotated
@@ -33,7 +33,7 @@ class CloudSet(NamedTuple):
     Attributes:
         source: Source of the clouds, for messages.
         description: Entries of the fingerprint besides sizes, names, labels and splits.
-        classes: Names of the classes, in the order of the labels.
+        classes: Names of the classes as `spell_name` returns them, in the order of the labels.
         packed: The clouds.
         labels: Class of each cloud.
         names: Name of each cloud.
@@ -44,6 +44,7 @@ class CloudSet(NamedTuple):
         validated_on: Name of the split whose clouds are used for validation.
         rotations: Number of copies of a training cloud, rotated about the up axis.
         remarks: Clauses about parts of the user's files that are not read.
+        needed: Names of the splits that must not be empty.
     """
 
     source: str
@@ -59,6 +60,7 @@ class CloudSet(NamedTuple):
     validated_on: str = "validation"
     rotations: int = 1
     remarks: tuple[str, ...] = ()
+    needed: tuple[str, ...] = Splits._fields
 
 
 class LabelledClouds(Data):
@@ -79,7 +81,7 @@ class LabelledClouds(Data):
 
     def prepare(self) -> None:
         cloud_set = self.load_clouds()
-        self.target = Target("class", tuple(map(spell_name, cloud_set.classes)))
+        self.target = Target("class", cloud_set.classes)
         self.input_shape = (cloud_set.packed.largest(), len(self.columns))
         self.synthetic, self.skipped = cloud_set.synthetic, cloud_set.skipped
         self.remarks = cloud_set.remarks
@@ -175,22 +177,24 @@ def split_clouds(cloud_set: CloudSet) -> dict[str, Clouds]:
         target = torch.from_numpy(cloud_set.labels[chosen])
         group = torch.zeros(len(chosen), dtype=torch.int64)
         clouds[name] = Clouds(cloud_set.packed, chosen, target=target, group=group, **fields)
-    require_samples({name: len(split) for name, split in clouds.items()}, cloud_set.source)
+    sizes = {name: len(split) for name, split in clouds.items()}
+    require_samples(sizes, cloud_set.source, cloud_set.needed)
     return clouds
 
 
-def require_samples(sizes: Mapping[str, int], source: str) -> None:
+def require_samples(sizes: Mapping[str, int], source: str, needed: Collection[str] = Splits._fields) -> None:
     """Refuse an empty split.
 
     Args:
         sizes: Name of a split → number of its samples.
         source: Source of the clouds, for the message.
+        needed: Names of the splits that must not be empty.
 
     Raises:
         DataError: A split is empty.
     """
     for split, size in sizes.items():
-        if size == 0:
+        if size == 0 and split in needed:
             counts = ", ".join(f"{name} {number}" for name, number in sizes.items())
             raise DataError(
                 f"{source}: The {split} split is empty ({counts}). At least one sample of each class is used for "

@@ -77,6 +77,12 @@ class Packed(NamedTuple):
         table = np.concatenate([np.empty((0, columns), np.float32), *clouds])
         return cls(torch.from_numpy(table), torch.from_numpy(np.cumsum([0, *map(len, clouds)])))
 
+    def digest(self) -> str:
+        """Return a hash of the clouds."""
+        content = hashlib.sha256(self.offset.numpy().tobytes())
+        content.update(self.points.contiguous().numpy().data)
+        return content.hexdigest()
+
     def largest(self) -> int:
         """Return the number of points of the largest cloud; 0 without clouds."""
         return int(self.offset.diff().max()) if len(self.offset) > 1 else 0
