@@ -513,10 +513,11 @@ def npz(content: bytes) -> Parsed:
     groups = {"normals": NORMALS, "colors": COLOURS, "colours": COLOURS}
     for name, values in stored_arrays.items():
         names = groups.get(name, (name,))
-        if values.dtype.kind not in "biuf" or values.shape not in {(len(points), len(names)), (len(points),)}:
+        shapes = [(len(points), len(names))] + [(len(points),)] * (len(names) == 1)
+        if values.dtype.kind not in "biuf" or values.shape not in shapes:
             continue  # an array that has no row for each point
         full = np.iinfo(values.dtype).max if names == COLOURS and values.dtype.kind == "u" else 1
-        parts.append(values.reshape(len(points), -1).astype(np.float64) / full)
+        parts.append(values.reshape(len(points), len(names)).astype(np.float64) / full)
         columns += column_names(names)
     attributes = np.concatenate(parts, 1) if parts else None
     return Parsed(table.vertices, faces.astype(np.int64), tuple(columns), attributes)
