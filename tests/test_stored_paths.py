@@ -162,6 +162,8 @@ def test_what_is_said_to_be_words_is_no_path() -> None:
         "images_with_angles.angle_columns",
         "images_with_angles.mirror",
         "point_cloud_folder.columns",
+        "labelled_points.label",
+        "labelled_points.classes",
         "decision_cost.actions",
         "decision_cost.number",
     }

@@ -1,0 +1,1 @@
+"""Data set of labelled scans, in which every point has a class."""

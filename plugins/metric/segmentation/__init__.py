@@ -1,0 +1,1 @@
+"""Accuracy and intersection over union of points in scans, with standard errors over scans."""
