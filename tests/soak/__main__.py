@@ -122,11 +122,13 @@ class State(Counts):
 
     Attributes:
         durations: Seconds of each command without a kill.
+        references: Names of the commits of these commands.
         paces: Factors for these seconds, by kind; below 1 if commands finish before a kill.
         attempts: Number of commands that were killed, by kind.
     """
 
     durations: dict[str, float] = field(default_factory=dict)
+    references: dict[str, str] = field(default_factory=dict)
     paces: dict[str, float] = field(default_factory=dict)
     attempts: dict[str, int] = field(default_factory=dict)
 
@@ -202,9 +204,10 @@ class Soak:
         return faults
 
     def whole(self, kind: Kind) -> Path:
-        """Return the folder of the command's run without a kill, which is made at the first call."""
+        """Return the folder of the command's run without a kill, which is made once for each commit of the project."""
+        commit = _commit()
         whole = self.folder / "whole" / _slug(kind.name) / "it"
-        if kind.name not in self.state.durations:
+        if self.state.references.get(kind.name) != commit:
             shutil.rmtree(whole.parent, ignore_errors=True)
             whole.parent.mkdir(parents=True)
             began = time.monotonic()
@@ -212,6 +215,8 @@ class Soak:
             if command.process.wait(timeout=600):
                 raise RuntimeError(f"{kind.name} failed: {command.output}")
             self.state.durations[kind.name] = time.monotonic() - began
+            self.state.paces.pop(kind.name, None)
+            self.state.references[kind.name] = commit
             self._save()
         return whole
 
@@ -233,8 +238,7 @@ class Soak:
         write_whole(self.folder / "state.json", json.dumps(asdict(self.state), indent=1).encode())
 
     def _note(self, name: str, number: int, faults: list[str], folder: Path) -> None:
-        describe = ("git", "describe", "--always", "--dirty", "--exclude=*")
-        commit = subprocess.run(describe, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+        commit = _commit()
         if commit not in self.state.commits:
             self.state.commits.append(commit)
         self.state.machine = environment("torch", "pytorch-lightning", "hydra-core", "mlflow", "ray")
@@ -284,6 +288,12 @@ def end_all(folder: Path) -> None:
             ours = f"{MARK}=".encode() in (process / "environ").read_bytes()
             if ours and (process / "cwd").readlink().is_relative_to(folder):
                 os.kill(int(process.name), signal.SIGKILL)
+
+
+def _commit() -> str:
+    """Return the name of the project's commit; it ends with "-dirty" if files were changed since."""
+    describe = ("git", "describe", "--always", "--dirty", "--exclude=*")
+    return subprocess.run(describe, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def _slug(name: str) -> str:
