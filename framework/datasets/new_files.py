@@ -1,4 +1,4 @@
-"""Further labelled files, on which a trained model is tested: which of them are tested, and their classes."""
+"""Test of a trained model on further labelled files: the choice of the files that are tested, and their classes."""
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -139,8 +139,8 @@ def index_labels(
 ) -> tuple[tuple[str, ...], Int[np.ndarray, "files"]]:
     """Return the names of the classes, and the class of each file as an index into them.
 
-    The classes are those of the trained model, of which the files need not have all; without a trained model they are
-    the labels in alphabetical order.
+    The classes are those of the trained model; the files need not have all of them. Without a trained model, the
+    classes are the labels in alphabetical order.
 
     Raises:
         DataError: A label is not a class of the trained model.

@@ -146,12 +146,12 @@ class LabelledPoints(Data):
         root: The folder of the scans.
         label: Name of the column or array of the labels.
         classes: Names of the labels 0, 1, 2, …; None: each label of the training scans is a class.
-        unlabelled: Labels of points without a class. They are no samples, but their neighbours see them.
+        unlabelled: Labels of points without a class. They are no samples, but they count as neighbours of other points.
         points: Largest number of points of a scan in training and validation, drawn at random. The test has all points.
         features: Settings of the features.
-        validation: Share of the scans for validation, without folders of splits; at least one scan. With 0, the
-            training points are also used for validation.
-        test: Share of the scans for the test, without folders of splits; at least one scan.
+        validation: Share of the scans for validation, if there are no folders of splits; at least one scan. With 0,
+            the training points are also used for validation.
+        test: Share of the scans for the test, if there are no folders of splits; at least one scan.
         data_seed: Seed of points, basis points and splits, independent of the seed of the run.
     """
 

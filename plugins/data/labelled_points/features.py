@@ -123,7 +123,7 @@ def local_features(
     parts = [positions]
     if features.neighbours:
         index = np.asarray(scan.tree.query(positions, features.neighbours + 1)[1])
-        # the point itself is in the last place where many points at its place precede it
+        # if more points coincide than are found, the point itself may not be among them; then the last one is dropped
         itself = index == rows[:, None]
         itself[~itself.any(1), -1] = True
         index = index[~itself].reshape(len(rows), features.neighbours)
