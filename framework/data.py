@@ -64,11 +64,14 @@ class Preprocessing(NamedTuple):
         location: mean of a typical array, of the shape `input_shape`; `mode=export` compares the exported model with
             the original one on arrays around it.
         scale: standard deviation of a typical array, of the shape `input_shape`.
+        missing: words, in small letters, that mark a missing number in a table, if `module` fills NaN; None if it does
+            not.
     """
 
     module: nn.Module
     location: Tensor
     scale: Tensor
+    missing: tuple[str, ...] | None = None
 
 
 class Data(ABC):

@@ -660,6 +660,34 @@ def test_words_in_a_file_are_read_as_the_data_set_reads_them(
         script.read_csv(file, ["colour=red", "x"])
 
 
+def test_missing_numbers_of_a_table_are_read_and_filled(tmp_path: Path) -> None:
+    """The network of an exported folder fills NaN; a column that ends with = marks where the numbers are missing."""
+    rows = [["1", "2", "a"], ["", "4", "b"], ["5", "NA", "a"], ["0", "1", "b"]] * 10
+    file = tmp_path / "holes.csv"
+    file.write_text("\n".join(["x,y,class", *map(",".join, rows)]), encoding="utf-8")
+    part = {"name": "tabular", "path": str(file), "target": "class", "missing": "median"}
+    data = build("data", resolve("data", part))
+    data.prepare()
+    preprocessing = data.preprocessing()
+    script = importlib.import_module("framework.deployment.exported_folder.predict")
+    array = script.read_csv(file, [*data.columns], preprocessing.missing)
+    assert data.columns == ("x", "y", "x=", "y=")
+    np.testing.assert_array_equal(
+        array[:4], [[1, 2, 0, 0], [math.nan, 4, 1, 0], [5, math.nan, 0, 1], [0, 1, 0, 0]]
+    )
+    torch.testing.assert_close(preprocessing.module(torch.from_numpy(array)), data.inputs(file))
+    with pytest.raises(ValueError, match="line 3: a cell is missing or not a number"):
+        script.read_csv(file, ["x", "y"])
+    model = script.Model.__new__(script.Model)
+    model._cloud, model._shape, model._dtype, model._fills = False, ["batch", 4], np.dtype("float64"), True
+    np.testing.assert_array_equal(model._array([[None, 4, 1, 0]]), array[1:2])
+    with pytest.raises(ValueError, match="row 1 are not finite"):
+        model._array([[1, 2, 0, 0], [math.inf, 4, 1, 0]])
+    model._fills = False
+    with pytest.raises(ValueError, match="row 0 are not finite"):
+        model._array([[math.nan, 4, 1, 0]])
+
+
 def test_the_exported_folder_needs_numpy_and_onnxruntime_alone(framework: Framework, tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
     cells = generator.normal(size=(80, 2)) * [1, 50] + [0, 1000]

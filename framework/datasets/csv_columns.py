@@ -433,6 +433,7 @@ def tables(
     setting: str,
     writing: Writing | None = None,
     arrange: Callable[[Columns], Columns] = lambda columns: columns,
+    missing: str | None = "",
 ) -> Iterator[tuple[Columns, Float[np.ndarray, "rows names"]]]:
     """Read a user's files one by one; yield each table, and the named columns as an array of numbers.
 
@@ -442,6 +443,7 @@ def tables(
         setting: the setting that names the columns.
         writing: notation of the tables. If it is given, TRUE and FALSE are read as 1 and 0.
         arrange: function that changes each table after it is read.
+        missing: treatment of missing numbers, as in `numbers`.
 
     Raises:
         DataError: there is no file, a file is not a readable table, a name is not a column of a table, or a named
@@ -455,7 +457,7 @@ def tables(
     for file in files:
         columns = arrange(read_columns(Path(file), writing))
         require(columns, names, setting)
-        values = [numbers(columns, name, missing="", booleans=writing is not None) for name in names]
+        values = [numbers(columns, name, missing=missing, booleans=writing is not None) for name in names]
         yield columns, np.stack(values, -1)
 
 

@@ -132,6 +132,8 @@ class Exporting:
             noise[::2, (shape[1] + 1) // 2 :] = torch.nan  # rows of NaN are padding
         if self.preprocessing is not None:
             noise = self.preprocessing.location + self.preprocessing.scale * noise
+            if self.preprocessing.missing is not None:
+                noise[1::2, 0] = torch.nan  # missing numbers
         return noise.to(self.dtype)
 
     @torch.no_grad()
@@ -653,6 +655,8 @@ def _input_entry(model: Exporting, shape: Sequence[int | str]) -> dict[str, Any]
     }
     if model.description.columns:
         entry["columns"] = list(model.description.columns)
+    if model.preprocessing is not None and model.preprocessing.missing is not None:
+        entry["missing"] = list(model.preprocessing.missing)
     return entry
 
 

@@ -78,6 +78,7 @@ class Model:
         self._noise: list[dict[str, Any]] = self.description.get("noise", [])
         self._random_of_seed: dict[int, list[NDArray[Any]]] = {}
         self._dtype = np.dtype(self.description["input"]["dtype"])
+        self._fills = "missing" in self.description["input"]
 
     def __call__(self, inputs: Any, seed: int = 0) -> Density:
         """Return the densities for a batch of inputs.
@@ -114,6 +115,8 @@ class Model:
     def _array(self, inputs: Any) -> NDArray[Any]:
         """Return inputs as an array of the type and shape that the network reads, checked."""
         array = padded(inputs) if self._cloud else np.asarray(inputs)
+        if self._fills and array.dtype.kind == "O":
+            array = _as_floats(array)  # None is a missing number
         if array.dtype.kind not in "buif":
             raise ValueError(
                 f"Got inputs of type {array.dtype}, but numbers are required. Give an array of numbers."
@@ -134,7 +137,7 @@ class Model:
         if self._cloud:
             _require_clouds(array)
         else:
-            _require_finite(array, "inputs")
+            _require_finite(np.where(np.isnan(array), 0, array) if self._fills else array, "inputs")
         return array
 
     def _random(self, count: int, seed: int) -> dict[str, NDArray[Any]]:
@@ -261,15 +264,37 @@ def read_array(file: Path, shape: list[Any]) -> NDArray[Any]:
     return array
 
 
-def read_csv(file: Path, columns: list[str]) -> NDArray[np.float64]:
+def _as_floats(array: NDArray[Any]) -> NDArray[Any]:
+    """Return an array of objects as numbers, NaN for None; unchanged if an object is no number."""
+    try:
+        return array.astype(np.float64)
+    except (TypeError, ValueError):
+        return array
+
+
+def read_csv(file: Path, columns: list[str], missing: Sequence[str] = ()) -> NDArray[np.float64]:
     """Return the named columns of a CSV file with a header, (row, column).
 
     A column `name=word` that the file does not have is 1 where the column `name` holds the word, and 0 elsewhere. A
-    word that belongs to none of these columns is reported on the error stream.
+    word that belongs to none of these columns is reported on the error stream. The column `name=` is 1 where a number
+    of the column `name` is missing.
+
+    Args:
+        file: the file.
+        columns: names of the columns.
+        missing: words, in small letters, that mark a missing number, which is NaN in the array; () if none may be
+            missing.
 
     Raises:
         ValueError: a column is missing, or a cell is not a number.
     """
+
+    def value(cell: str, word: str | None) -> float:
+        is_hole = cell.lower() in missing
+        if word is None:
+            return math.nan if is_hole else float(cell)
+        return float(cell == word if word else is_hole)
+
     with file.open(encoding="utf-8-sig", newline="") as stream:
         reader = csv.DictReader(stream)
         sources = [_source_of(name, reader.fieldnames or ()) for name in columns]
@@ -280,17 +305,12 @@ def read_csv(file: Path, columns: list[str]) -> NDArray[np.float64]:
             )
         words: dict[str, set[str]] = {}
         for name, word in filter(None, sources):
-            if word is not None:
+            if word:
                 words.setdefault(name, set()).add(word)
         rows, unknown = [], Counter[tuple[str, str]]()
         for line in reader:
             try:
-                rows.append(
-                    [
-                        float(line[name]) if word is None else float(line[name].strip() == word)
-                        for name, word in filter(None, sources)
-                    ]
-                )
+                rows.append([value(line[name].strip(), word) for name, word in filter(None, sources)])
                 unknown.update(
                     (name, cell) for name in words if (cell := line[name].strip()) not in words[name]
                 )
@@ -391,7 +411,7 @@ def main(arguments: Mapping[str, Any] | None = None) -> None:
     try:
         columns = model.description["input"].get("columns") or []
         if options.inputs.suffix.lower() == ".csv" and columns:
-            inputs = read_csv(options.inputs, columns)
+            inputs = read_csv(options.inputs, columns, model.description["input"].get("missing", ()))
         else:
             inputs = read_array(options.inputs, model.description["input"]["shape"])
         rows = list(model.table(inputs, options.interval))

@@ -53,7 +53,10 @@ class Tabular(Data):
         test: Share of the rows for the test, chosen at random, if there is no column `split`; 1 makes all rows of a
             table test rows, for a model that was trained on another table.
         data_seed: Seed of the choice of these rows, independent of the seed of the run.
-        missing: Treatment of rows without a number or a label. "error" refuses them, "skip" leaves them out.
+        missing: Treatment of rows without a number or a label. "error" refuses them, "skip" leaves them out. "median"
+            fills missing inputs with the median of the training rows, adds a column `name=` that is 1 where a number of
+            the column `name` is missing, if some are missing in the training rows, and leaves out rows without a
+            target.
         small_angles: Whether angles in degrees may all lie within ±2π; by default this is refused, because such angles
             look like radians.
         words: Treatment of columns of words. "leave_out" does not read them; "levels" reads a column of 0 and 1 for
@@ -156,9 +159,10 @@ class Tabular(Data):
         return from_memory(user_data, self._input_columns)
 
     def preprocessing(self) -> Preprocessing:
-        scaling = self._input_columns.scaling
+        scaling, fill = self._input_columns.scaling, self._input_columns.fill
         largest, mean, deviation = (torch.from_numpy(np.asarray(part, np.float64)) for part in scaling)
-        return Preprocessing(Standardise(scaling), largest * mean, largest * deviation)
+        missing = None if fill is None else tuple(sorted(self.writing.missing))
+        return Preprocessing(Standardise(scaling, fill), largest * mean, largest * deviation, missing)
 
     @property
     def _input_columns(self) -> InputColumns:
@@ -166,11 +170,12 @@ class Tabular(Data):
         return self._trained or self._table.inputs
 
     def state_dict(self) -> Mapping[str, Any]:
-        names, scaling, labels, content = self._input_columns
+        names, scaling, labels, content, fill = self._input_columns
         numbers = {name: array.tolist() for name, array in scaling._asdict().items()}
         # a model that an older version stored has neither labels nor the hash of a table
         optional = {"labels": list(labels)} if labels else {}
         optional |= {"content": content} if content else {}
+        optional |= {} if fill is None else {"fill": fill.tolist()}
         return {"columns": list(names), **numbers, **optional}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

@@ -1,4 +1,8 @@
-"""Columns of words as numbers: one column of 0 and 1 for each level. A level is a word that occurs in the column."""
+"""Columns of 0 and 1: one for each level of a column of words, and one that says where a column of numbers has holes.
+
+A level is a word that occurs in a column. The empty level marks missing cells: the column `age=` is 1 where the column
+`age` holds no number.
+"""
 
 import logging
 from collections import Counter
@@ -13,6 +17,8 @@ from framework.errors import quote
 
 MOST_LEVELS = 50
 """Largest number of levels of a column; a column with more is left out, since it holds names or free text."""
+HOLES = frozenset(("", "nan", "none", "<na>", "nat"))
+"""Texts, in small letters, of missing values in memory."""
 _log = logging.getLogger(__name__)
 
 
@@ -68,9 +74,10 @@ def add_levels(cells: Columns, names: Sequence[str]) -> Columns:
     columns = dict(cells.cells)
     for column, levels in known_levels(names, cells.cells).items():
         for level in levels:
-            columns[name_of(column, level)] = _indicator(cells.cells[column], level)
-        unknown = _levels(cells, column)
-        report_unknown({word: count for word, count in unknown.items() if word not in levels}, column)
+            columns[name_of(column, level)] = _indicator(cells.cells[column], level, cells.notation.missing)
+        if levels != [""]:
+            unknown = _levels(cells, column)
+            report_unknown({word: count for word, count in unknown.items() if word not in levels}, column)
     return replace(cells, cells=columns)
 
 
@@ -101,7 +108,10 @@ def levels_in_memory(user_data: Any, names: Sequence[str]) -> dict[str, np.ndarr
         words = np.array([str(word).strip() for word in np.atleast_1d(np.asarray(user_data[column], object))])
         for level in levels:
             columns[name_of(column, level)] = (words == level).astype(np.float64)
-        report_unknown(Counter(word for word in words.tolist() if word not in levels), column)
+            if not level:
+                columns[name_of(column, level)] = np.array([word.lower() in HOLES for word in words], float)
+        if levels != [""]:
+            report_unknown(Counter(word for word in words.tolist() if word not in levels), column)
     return columns
 
 
@@ -122,5 +132,8 @@ def _levels(cells: Columns, name: str) -> Counter[str]:
     return Counter(word for word in cells.cells[name] if word.lower() not in cells.notation.missing)
 
 
-def _indicator(words: Sequence[str], level: str) -> list[str]:
+def _indicator(words: Sequence[str], level: str, missing: Collection[str] = ()) -> list[str]:
+    """Return 1 for each cell that holds the level, or for the empty level for each missing cell, and 0 for others."""
+    if not level:
+        return ["1" if word.lower() in missing else "0" for word in words]
     return ["1" if word == level else "0" for word in words]

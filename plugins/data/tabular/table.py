@@ -36,10 +36,16 @@ from framework.errors import DataError, did_you_mean, quote, shorten
 from framework.storage import text
 from framework.storage.arrays import to_real
 from framework.target import Target
-from plugins.data.tabular.levels import add_levels, expand_words, explain_many_levels, levels_in_memory
+from plugins.data.tabular.levels import (
+    add_levels,
+    expand_words,
+    explain_many_levels,
+    levels_in_memory,
+    name_of,
+)
 
 Kind = Literal["class", "real", "degrees", "radians"]
-Missing = Literal["error", "skip"]
+Missing = Literal["error", "skip", "median"]
 WordColumns = Literal["leave_out", "levels"]
 SPLITS = Splits._fields
 SPLIT, GROUP = "split", "group"
@@ -59,7 +65,8 @@ class Question(NamedTuple):
         columns: Columns of the input; None for every other column whose cells are mostly numbers.
         validation, test: Shares of the rows for these splits, if there is no column `split`.
         data_seed: Seed of the random splits.
-        missing: Treatment of rows without a number or a label. "error" refuses them, "skip" leaves them out.
+        missing: Treatment of rows without a number or a label. "error" refuses them, "skip" leaves them out, "median"
+            fills missing inputs and leaves out rows without a target.
     """
 
     target: tuple[str, ...]
@@ -99,12 +106,17 @@ class InputColumns(NamedTuple):
         scaling: Scaling of the columns.
         labels: Classes of the target; () for a target of another kind, or if an older version stored the model.
         content: Hash of the cells of the training table; "" if an older version stored the model.
+        fill: Median of each column in the training rows, which replaces missing numbers; None if none may be missing.
     """
 
     names: tuple[str, ...]
     scaling: Scaling
     labels: tuple[str, ...] = ()
     content: str = ""
+    fill: Float[np.ndarray, "column"] | None = None
+
+
+FILL = "data.missing=median"
 
 
 def restore_columns(state: Mapping[str, Any]) -> InputColumns:
@@ -119,13 +131,18 @@ def restore_columns(state: Mapping[str, Any]) -> InputColumns:
     are_names = bool(names) and all(isinstance(name, str) for name in names)
     are_names &= isinstance(labels, list | tuple) and all(isinstance(label, str) for label in labels)
     are_names &= isinstance(content, str)
+    fill = None
     try:
         scaling = Scaling(*(np.array(state[name], np.float64) for name in Scaling._fields))
+        fill = np.array(state["fill"], np.float64) if "fill" in state else None
     except (KeyError, TypeError, ValueError):
         scaling = Scaling(*(np.zeros(0) for _ in Scaling._fields))
     if (
         not are_names
-        or any(part.shape != (len(names),) or not np.isfinite(part).all() for part in scaling)
+        or any(
+            part.shape != (len(names),) or not np.isfinite(part).all()
+            for part in (*scaling, *([] if fill is None else [fill]))
+        )
         or (scaling.largest <= 0).any()
         or (scaling.deviation <= 0).any()
     ):
@@ -133,7 +150,7 @@ def restore_columns(state: Mapping[str, Any]) -> InputColumns:
             f"The stored state of tabular must hold {', '.join(Scaling._fields)} of each input column, but holds "
             "something else. Load another checkpoint, or train the model again."
         )
-    return InputColumns(tuple(names), scaling, tuple(labels), content)
+    return InputColumns(tuple(names), scaling, tuple(labels), content, fill)
 
 
 class Table(NamedTuple):
@@ -206,11 +223,22 @@ def load(
         choice = choice._replace(left_out=explain_many_levels(cells, choice.left_out))
     columns = choice.names
     require(cells, columns, "The trained model")
+    fills = question.missing == "median"
+    if fills and trained is not None and trained.fill is None:
+        raise DataError(
+            f"{FILL} fills missing numbers with the medians of the training rows, but the model was trained without "
+            "this setting and stores no medians. Leave it out, or train the model again with it."
+        )
     skip_remedy = "set data.missing=skip to leave such rows out" if question.missing == "error" else None
-    inputs = np.stack([numbers(cells, name, missing=skip_remedy, booleans=True) for name in columns], -1)
+    fill_remedy = (
+        None
+        if skip_remedy is None
+        else f"set {FILL} to fill in the median of the training rows, or {skip_remedy}"
+    )
+    inputs = np.stack([numbers(cells, name, missing=fill_remedy, booleans=True) for name in columns], -1)
     values, absent = _targets(cells, question, skip_remedy)
     _check_unit(cells, question, values, small_angles=small_angles)
-    complete = ~(np.isnan(inputs).any(-1) | absent)
+    complete = ~absent if fills else ~(np.isnan(inputs).any(-1) | absent)
     rows = np.flatnonzero(complete)
     groups, group = _groups(file, cells, rows)
     split, remarks = _splits(cells, rows, values, question, trained, content)
@@ -218,6 +246,14 @@ def load(
     fitted_rows = (
         training if len(training) else rows
     )  # a table for the test of a trained model has no training rows
+    fill = None
+    if fills:
+        remarks += _describe_holes(columns, inputs[rows])
+        if trained is None:
+            columns, inputs, fill = _mark_holes(cells, columns, inputs, fitted_rows)
+        else:
+            fill = trained.fill
+    inputs = fill_missing(inputs, fill)
     scaling, constant = fit_scaling(inputs[fitted_rows])
     scaling = scaling if trained is None else trained.scaling
     labels = () if trained is None else trained.labels
@@ -244,7 +280,7 @@ def load(
     )
     return Table(
         target,
-        InputColumns(columns, scaling, target.names if target.kind == "class" else (), content),
+        InputColumns(columns, scaling, target.names if target.kind == "class" else (), content, fill),
         constant_names,
         groups,
         Splits(**parts),
@@ -264,7 +300,9 @@ def read(files: Sequence[Path], columns: InputColumns, writing: Writing | None =
     parts = []
     notation, setting = writing or LabelledWriting(), "The trained model"
     arrange = partial(add_levels, names=columns.names)
-    for cells, inputs in tables(files, columns.names, setting, notation, arrange):
+    remedy = None if columns.fill is not None else f"train the model with {FILL}, which fills such cells"
+    for cells, inputs in tables(files, columns.names, setting, notation, arrange, remedy):
+        inputs = fill_missing(inputs, columns.fill)
         rows = np.arange(len(inputs))
         parts.append(as_float32(cells, columns.names, rows, standardise(inputs, columns.scaling)))
     inputs = torch.cat(parts)
@@ -273,6 +311,8 @@ def read(files: Sequence[Path], columns: InputColumns, writing: Writing | None =
 
 def from_memory(user_data: Any, columns: InputColumns) -> Float[Tensor, "row column"]:
     """Return standardised inputs from rows in memory: a DataFrame, a mapping by column, or an array in column order.
+
+    If the model fills missing numbers, these are NaN or None, and an array may lack the columns that mark them.
 
     Raises:
         DataError: A column is missing, a cell is not a finite number, or an array has another number of columns.
@@ -294,14 +334,19 @@ def from_memory(user_data: Any, columns: InputColumns) -> Float[Tensor, "row col
             f"The input cannot be read as rows of numbers: {str(error)[:200]}. Give rows of numbers, in the columns "
             f"{', '.join(columns.names)}."
         ) from error
-    rows = as_inputs(rows, (len(columns.names),)).numpy()
-    scaled = standardise(rows, columns.scaling)
+    rows = as_inputs(_add_marks(rows, columns), (len(columns.names),)).numpy()
+    scaled = standardise(fill_missing(rows, columns.fill), columns.scaling)
     wrong = np.argwhere(~(np.abs(scaled) <= np.finfo(np.float32).max))
     if len(wrong):
         row, column = wrong[0]
         raise DataError(
             f"Row {row}, column {columns.names[column]!r}: {rows[row, column]} is not a finite number within single "
             "precision. Correct the number, or leave the row out."
+            + (
+                f" A model that is trained with {FILL} fills missing numbers."
+                if np.isnan(rows[row, column])
+                else ""
+            )
         )
     return torch.from_numpy(scaled.astype(np.float32))
 
@@ -312,15 +357,82 @@ class Standardise(nn.Module):
     largest: Tensor
     mean: Tensor
     deviation: Tensor
+    fill: Tensor | None
 
-    def __init__(self, scaling: Scaling) -> None:
+    def __init__(self, scaling: Scaling, fill: np.ndarray | None = None) -> None:
         super().__init__()
+        self.register_buffer("fill", None if fill is None else torch.from_numpy(fill))
         for name, part in zip(Scaling._fields, scaling, strict=True):
             self.register_buffer(name, torch.from_numpy(np.asarray(part, np.float64)))
 
     def forward(self, rows: Tensor) -> Tensor:
-        """Return standardised rows, float32, for rows in their own units, float64."""
+        """Return standardised rows, float32, for rows in their own units, float64, in which `fill` replaces NaN."""
+        if self.fill is not None:
+            rows = torch.where(rows.isnan(), self.fill, rows)
         return ((rows / self.largest - self.mean) / self.deviation).float()
+
+
+def fill_missing(
+    inputs: Float[np.ndarray, "row column"], fill: Float[np.ndarray, "column"] | None
+) -> Float[np.ndarray, "row column"]:
+    """Return the inputs with `fill` in place of NaN; unchanged if there is no `fill`."""
+    return inputs if fill is None else np.where(np.isnan(inputs), fill, inputs)
+
+
+def _mark_holes(
+    cells: Columns, columns: tuple[str, ...], inputs: np.ndarray, training: np.ndarray
+) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    """Return columns and inputs with a further column for each column with holes in the training rows, and the medians.
+
+    The further column `name=` is 1 where a number is missing, and 0 elsewhere.
+
+    Args:
+        cells: The table.
+        columns: Names of the input columns.
+        inputs: Inputs (row, column), NaN where a number is missing.
+        training: Indices of the training rows.
+
+    Raises:
+        DataError: A column has no number in the training rows.
+    """
+    holes = np.isnan(inputs)
+    empty = holes[training].all(0)
+    if empty.any():
+        name = columns[int(empty.argmax())]
+        raise DataError(
+            f"{cells.file}, column {name!r}: No training row has a number, so that there is no median for {FILL}. "
+            "Leave the column out by data.columns, or add rows."
+        )
+    marked = [
+        index
+        for index, name in enumerate(columns)
+        if holes[training, index].any() and name_of(name, "") not in cells.cells
+    ]
+    fill = np.concatenate([np.nanmedian(inputs[training], axis=0), np.zeros(len(marked))])
+    names = (*columns, *(name_of(columns[index], "") for index in marked))
+    return names, np.concatenate([inputs, holes[:, marked]], -1), fill
+
+
+def _add_marks(rows: np.ndarray, columns: InputColumns) -> np.ndarray:
+    """Return an array of rows with the columns that mark missing numbers, if it has all columns but these."""
+    plain = [name for name in columns.names if not (name.endswith("=") and name[:-1] in columns.names)]
+    if columns.fill is None or rows.ndim not in (1, 2) or rows.shape[-1] != len(plain):
+        return rows
+    parts = {name: rows[..., index] for index, name in enumerate(plain)}
+    return np.stack(
+        [parts[name] if name in parts else np.isnan(parts[name[:-1]]) for name in columns.names], -1
+    )
+
+
+def _describe_holes(columns: Sequence[str], inputs: np.ndarray) -> tuple[str, ...]:
+    """Return a remark with the number of missing inputs that are filled, by column."""
+    counts = np.isnan(inputs).sum(0).tolist()
+    listed = [f"{quote(name)} ({count})" for name, count in zip(columns, counts, strict=True) if count]
+    if not listed:
+        return ()
+    return (
+        f"missing numbers, which are filled with the median of the training rows: {shorten(', '.join(listed), 200)}",
+    )
 
 
 def fit_scaling(inputs: Float[np.ndarray, "row column"]) -> tuple[Scaling, np.ndarray]:

@@ -12,6 +12,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sklearn.impute import SimpleImputer
+from sklearn.preprocessing import StandardScaler
 
 from framework.configuration.schema import build, resolve
 from framework.datasets.fields import Fields
@@ -20,7 +22,7 @@ from framework.testing.commands import run_commands
 from framework.testing.data_samples import fields_of
 from plugins.data.tabular.data import Tabular
 from plugins.data.tabular.picture import HEIGHT, bars
-from plugins.data.tabular.table import fit_scaling, standardise
+from plugins.data.tabular.table import Standardise, fit_scaling, standardise
 
 SPLITS = ("train", "validation", "test")
 ROWS = 40
@@ -196,7 +198,8 @@ def with_cell(cell: str, line: int = 5, column: int = 0) -> str:
         (with_cell("abc"), r"mine\.csv line 5, column 'x': 'abc' is not a finite number"),
         (
             with_cell(""),
-            r"line 5, column 'x': The cell is empty, but .* Or set data\.missing=skip to leave such rows out",
+            r"line 5, column 'x': The cell is empty, but .* Or set data\.missing=median to fill .*, or set "
+            r"data\.missing=skip to leave such rows out",
         ),
         (with_cell("nan", 7, 1), r"line 7, column 'y': 'nan' is not a finite number"),
         (with_cell("-inf", 7, 1), r"line 7, column 'y': '-inf' is not a finite number"),
@@ -561,3 +564,65 @@ def test_training_test_and_prediction_run_with_every_kind_of_target(tmp_path: Pa
             numbers = list(row.values())[1:]
         assert names[-1] == "entropy_nats"
         assert all(math.isfinite(float(cell)) for cell in numbers)
+
+
+def write_holes(folder: Path, rows: int = ROWS, start: int = 0) -> tuple[Path, np.ndarray]:
+    """Write a table with holes in two of three input columns, and return its file and its inputs."""
+    inputs = np.random.default_rng(start).normal(size=(rows, 3)) * [1, 50, 3] + [0, 1000, 0]
+    inputs[::5, 0], inputs[1::7, 1] = np.nan, np.nan
+    file = folder / f"holes{start}.csv"
+    lines = [
+        ",".join([*("" if np.isnan(cell) else f"{cell!r}" for cell in row), "cat" if index % 2 else "dog"])
+        for index, row in enumerate(inputs.tolist())
+    ]
+    file.write_text("\n".join(["a,b,c,class", *lines]).replace(",,", ",NA,"), encoding="utf-8")
+    return file, inputs
+
+
+def test_missing_inputs_are_filled_as_scikit_learn_does(tmp_path: Path) -> None:
+    file, inputs = write_holes(tmp_path)
+    data = prepare_data(file, missing="median")
+    assert data.columns == ("a", "b", "c", "a=", "b=") and data.input_shape == (5,) and data.skipped == 0
+    assert any("'a' (8), 'b' (6)" in remark for remark in data.remarks)
+    training = inputs[fields_of(data, "train")["line"].numpy() - 2]
+    imputer = SimpleImputer(strategy="median", add_indicator=True).fit(training)
+    scaler = StandardScaler().fit(imputer.transform(training))
+    for name in SPLITS:
+        rows = inputs[fields_of(data, name)["line"].numpy() - 2]
+        np.testing.assert_allclose(
+            fields_of(data, name)["input"], scaler.transform(imputer.transform(rows)), atol=1e-6
+        )
+    # a trained model fills further rows by the medians of its training rows, however they are given
+    new = build_data(file, missing="median")
+    new.load_state_dict(data.state_dict())
+    other, rows = write_holes(tmp_path, 9, start=1)
+    expected = scaler.transform(imputer.transform(rows))
+    named = dict(zip("abc", rows.T, strict=True))
+    absent = {name: [None if np.isnan(cell) else cell for cell in named[name]] for name in "abc"}
+    marked = np.column_stack([rows, np.isnan(rows[:, :2])])
+    computed = Standardise(new._input_columns.scaling, new._input_columns.fill)(torch.from_numpy(marked))
+    given = [other, named, absent, rows, rows[0], marked]
+    for inputs_of_new in (*(new.inputs(user_data) for user_data in given), computed):
+        np.testing.assert_allclose(inputs_of_new, expected[: len(inputs_of_new)], atol=1e-6)
+
+
+def test_missing_inputs_that_cannot_be_filled_are_refused(tmp_path: Path) -> None:
+    file, _ = write_holes(tmp_path)
+    with pytest.raises(DataError, match=r"line 2, column 'a': .* Or set data\.missing=median to fill in"):
+        prepare_data(file)
+    plain = prepare_data(file, missing="skip")
+    new = build_data(file, missing="median")
+    new.load_state_dict(plain.state_dict())
+    with pytest.raises(DataError, match="was trained without this setting"):
+        new.prepare()
+    with pytest.raises(DataError, match=r"train the model with data\.missing=median"):
+        new.inputs(file)
+    with pytest.raises(DataError, match=r"trained with data\.missing=median"):
+        new.inputs({"a": [math.nan], "b": [1.0], "c": [2.0]})
+    parts = ("train", "train", "validation", "test")
+    lines = [f"{row},{row if row % 4 > 1 else ''},{'ab'[row % 2]},{parts[row % 4]}" for row in range(ROWS)]
+    empty = table(tmp_path, "\n".join(["x,y,class,split", *lines]))
+    with pytest.raises(DataError, match="column 'y': No training row has a number"):
+        prepare_data(empty, missing="median")
+    with pytest.raises(DataError, match="stored state of tabular must hold"):
+        new.load_state_dict({**plain.state_dict(), "fill": [math.nan] * 3})
