@@ -199,12 +199,25 @@ def test_a_disk_without_room_is_refused_before_writing(
     WholeCheckpoints().save_checkpoint({**contents, "tied": contents}, saved)
 
 
-def test_a_disk_that_fills_up_while_writing(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("number", "message"),
+    [
+        (errno.ENOSPC, r"last\.ckpt needs .* MB free.* Free some space"),
+        (
+            errno.EFBIG,
+            r"last\.ckpt needs .* a limit of the system is smaller \(File too large\)\..*ulimit -f",
+        ),
+        (errno.EDQUOT, r"last\.ckpt needs .* a limit of the system is smaller \(.*quota.*\)\."),
+    ],
+)
+def test_a_disk_that_fills_up_while_writing(
+    saved: Path, monkeypatch: pytest.MonkeyPatch, number: int, message: str
+) -> None:
     def full(descriptor: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
+        raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(CheckpointError, match=r"last\.ckpt needs .* MB free"):
+    with pytest.raises(CheckpointError, match=message):
         WholeCheckpoints().save_checkpoint({"epoch": 4}, saved)
     assert [path.name for path in saved.parent.iterdir()] == ["last.ckpt"]
     assert same(read(saved), CONTENTS)

@@ -3,6 +3,7 @@
 A checkpoint is written to a temporary file, synced to disk and renamed, and its checksum is verified before it is read.
 """
 
+import errno
 import hashlib
 import os
 import shutil
@@ -54,7 +55,7 @@ def write(checkpoint: Mapping[str, Any], path: Path) -> None:
         # after a failed write, torch raises a second error when it closes the file
         fault = error if isinstance(error, OSError) else error.__context__
         if isinstance(fault, OSError) and is_disk_full(fault):
-            raise _no_room(path, needed) from fault
+            raise _no_room(path, needed, fault) from fault
         raise
 
 
@@ -189,11 +190,16 @@ def _require_plain(partial: Path, path: Path, checkpoint: Mapping[str, Any]) -> 
         ) from None
 
 
-def _no_room(path: Path, needed: int) -> CheckpointError:
+def _no_room(path: Path, needed: int, fault: OSError | None = None) -> CheckpointError:
     free = shutil.disk_usage(path.parent).free
+    if fault is None or fault.errno == errno.ENOSPC:
+        reason, remedy = f"the disk has only {free / 1e6:.3g} MB free", "Free some space"
+    else:  # the free space of the disk is not the reason
+        reason = f"a limit of the system is smaller ({fault.strerror})"
+        remedy = "Raise the limit (ulimit -f) or the quota, or free some space,"
     return CheckpointError(
-        f"The checkpoint {path} needs {needed / 1e6:.3g} MB, but the disk has only {free / 1e6:.3g} MB free. The "
-        "checkpoint was not written; earlier checkpoints are unchanged. Free some space and resume the run."
+        f"The checkpoint {path} needs {needed / 1e6:.3g} MB, but {reason}. The checkpoint was not written; earlier "
+        f"checkpoints are unchanged. {remedy} and resume the run."
     )
 
 
