@@ -1,5 +1,6 @@
 """Reports: what a page says, that it loads nothing and runs nothing of a stranger, and how large it may be."""
 
+import ast
 import json
 import math
 import re
@@ -18,6 +19,7 @@ from scipy import stats
 from framework.errors import ConfigError, DataError
 from framework.evaluation.significance import holm, paired_difference
 from framework.reports.page import PNG
+from framework.reports.report import load_call
 from framework.sweeps.pages import LARGEST_FIGURE, write_report
 from tests.conftest import TINY, Framework
 
@@ -181,6 +183,14 @@ def test_the_command_reports_on_a_run(framework: Framework, tmp_path: Path) -> N
     assert "All data of this report are synthetic" in text
     done = framework("mode=report", "mode.run=nowhere", folder=None)
     assert done.code == 2 and "mode.run=nowhere is not a folder" in done.out
+
+
+@pytest.mark.parametrize("name", ["plain", "it's", 'a "b" c\'d', "back\\slash", "Ünï {x}", "two\nlines"])
+def test_the_line_that_loads_a_model_is_python_for_any_path(name: str) -> None:
+    call = ast.parse(load_call(Path("/runs") / name), mode="eval").body
+    assert isinstance(call, ast.Call)
+    assert ast.literal_eval(call.args[0]) == f"/runs/{name}"
+    assert "\n" not in load_call(name)
 
 
 @pytest.mark.slow

@@ -228,8 +228,7 @@ def _next_steps(run: Run, run_cost: Cost, console: Console) -> None:
         report_command(run),
         "and mode=calibrate, mode=export, sweeps: docs/commands.md",
     ]
-    steps = [f"in a notebook: framework.load('{model}')"]
-    print_last_lines(run, run_cost, existing, steps, commands, console)
+    print_last_lines(run, run_cost, existing, [f"in a notebook: {load_call(model)}"], commands, console)
 
 
 def print_last_lines(
@@ -255,6 +254,11 @@ def print_last_lines(
         *(f"{'' if number else 'next commands:':15}{command}" for number, command in enumerate(commands)),
     ]
     console.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
+
+
+def load_call(model: Path | str | None) -> str:
+    """Return the line of Python that loads a model from its run folder or checkpoint."""
+    return f"framework.load({str(model)!r})"
 
 
 def report_command(run: Run) -> str:
