@@ -33,7 +33,9 @@ class DensityHead(nn.Module, ABC):
 
     Raw parameters may be any finite numbers, however large. The head maps them to a density whose log_prob is finite
     wherever the true one is, in float32 and float64; half precision is upcast to float32. Non-finite raw parameters are
-    refused with a `ValueError` that names the first bad batch row. A batch may have any shape and may be empty.
+    refused with a `ValueError` that names the first bad batch row. A batch may have any shape and may be empty. A
+    density may be 0 for some real numbers, such as negative ones; `mode=check` then needs possible targets
+    (`values` of `framework.testing.rows.HeadRow`).
     """
 
     group: ClassVar[str] = "density_head"

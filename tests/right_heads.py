@@ -239,6 +239,72 @@ class LogisticHead(_OfReals):
         self.factor.copy_(factors[int(torch.stack(found).argmax())])
 
 
+class LogNormal(Distribution):
+    """Density of exp(z) for a normal number z, which is 0 for negative numbers."""
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+
+    @property
+    def support(self) -> constraints.Constraint:
+        return constraints.independent(constraints.positive, 1)
+
+    def __init__(self, place: Tensor, width: Tensor) -> None:
+        self.place, self.width = place, width
+        super().__init__(place.shape[:-1], place.shape[-1:], validate_args=False)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        possible = value > 0
+        log_value = torch.where(possible, value, 1.0).log()
+        size = -((log_value - self.place) / self.width).square() / 2 - log_value
+        log_prob = size - self.width.log() - math.log(2 * math.pi) / 2
+        return torch.where(possible, log_prob, -math.inf).sum(-1)
+
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        with torch.no_grad():
+            noise = torch.randn(
+                *sample_shape, *self.place.shape, dtype=self.place.dtype, device=self.place.device
+            )
+            return (self.place + self.width * noise).exp()
+
+    def entropy(self) -> Tensor:
+        return (self.place + self.width.log() + (1 + math.log(2 * math.pi)) / 2).sum(-1)
+
+    @property
+    def mode(self) -> Tensor:
+        return (self.place - self.width.square()).exp()
+
+    @property
+    def mean(self) -> Tensor:
+        return (self.place + self.width.square() / 2).exp()
+
+    @property
+    def variance(self) -> Tensor:
+        return torch.expm1(self.width.square()) * (2 * self.place + self.width.square()).exp()
+
+
+estimate.register(LogNormal, exact_estimate)
+
+
+@marginal.register
+def _(density: LogNormal, index: int) -> LogNormal:
+    return LogNormal(density.place[..., index : index + 1], density.width[..., index : index + 1])
+
+
+class LogNormalHead(DensityHead):
+    """Log-normal densities of positive numbers."""
+
+    bibtex = ""
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        target.require("real", by="LogNormalHead")
+        self.size = 2 * len(target.names)
+
+    def forward(self, raw: Tensor) -> LogNormal:
+        place, width = require_finite(raw, self.size).chunk(2, -1)
+        return LogNormal(place.clamp(-20, 20), width.clamp(-5, 1).exp())
+
+
 class WrappedNormal(_Located):
     """Σ_k N(φ + 2πk; μ, σ²) for each angle (Mardia & Jupp 2000, §3.5.7), σ ≤ 2."""
 
@@ -309,16 +375,23 @@ HEADS: Mapping[str, tuple[type[DensityHead], tuple[Target, ...]]] = {
     "Student's t, freedom predicted": (LearnedTHead, (Target("real", ("height",)),)),
     "Laplace": (LaplaceHead, (Target("real", ("height",)), Target("real", ("x", "y")))),
     "logistic": (LogisticHead, (Target("real", ("height",)), Target("real", ("x", "y")))),
+    "log-normal": (LogNormalHead, (Target("real", ("height",)),)),
     "wrapped normal": (
         WrappedNormalHead,
         (Target("angle", ("azimuth",)), Target("angle", ("azimuth", "tilt"))),
     ),
 }
+VALUES: Mapping[str, Callable[[int], Tensor]] = {
+    "log-normal": lambda count: torch.randn(count, 1, generator=torch.Generator().manual_seed(0)).exp()
+}
+"""Name of a head → its targets, if its density is 0 for some real numbers."""
 
 
 def right_findings(name: str, target: Target) -> Iterator[Finding]:
     """Yield all findings of the head with this name."""
     kind = HEADS[name][0]
-    subject = HeadSubject(HeadRow(name, target), lambda: kind(target), build_for=kind)
+    subject = HeadSubject(
+        HeadRow(name, target, values=VALUES.get(name)), lambda: kind(target), build_for=kind
+    )
     yield from examine_head(subject)
     yield from examine_densities(subject)

@@ -13,7 +13,9 @@ from framework.testing.adaptive import boxes
 from framework.testing.densities import integral_by_draws
 from framework.testing.finding import Worst, require
 from framework.testing.head_subject import HeadSubject
+from framework.testing.heads import examine_head
 from framework.testing.precision import reference
+from framework.testing.rows import HeadRow
 from plugins.density_head.latent.decoder import LatentDecoder
 from plugins.density_head.latent.rows import ROWS
 from plugins.density_head.von_mises.density import VonMises
@@ -21,7 +23,7 @@ from tests.conftest import first_of_each
 from tests.planted_faults import ALL_FAULTS
 from tests.planted_heads import CLASSES, HEIGHT, IMAGE, ONE, PLACE, THREE, TWO, Fault
 from tests.planted_questions import FURTHER_FAULTS
-from tests.right_heads import HEADS, right_findings
+from tests.right_heads import HEADS, LogNormalHead, right_findings
 
 ALONE = {fault.only.rpartition(": ")[2] for fault in (*ALL_FAULTS, *FURTHER_FAULTS)}
 """Names of the properties that the planted faults break, without the structure (mixture, power) of the density."""
@@ -61,6 +63,14 @@ def test_the_fault_is_found_by_the_property_that_is_for_it(fault: Fault) -> None
 def test_a_right_head_of_somebody_else_is_not_refused(name: str, target: Target) -> None:
     """Check with one seed of the random draws; benchmarks/framework/check.py tries more seeds."""
     require(*right_findings(name, target))
+
+
+def test_the_finding_of_a_density_that_is_0_for_some_targets_says_what_to_do() -> None:
+    target = Target("real", ("height",))
+    subject = HeadSubject(HeadRow("positive", target), lambda: LogNormalHead(target), only="number types")
+    (finding,) = examine_head(subject)
+    assert not finding.holds
+    assert "list targets for which it is not in HeadRow.values" in str(finding)
 
 
 @pytest.mark.parametrize("size", [3, 15])

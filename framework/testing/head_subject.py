@@ -1,6 +1,7 @@
 """A density head under test, with seeded raw parameters and targets for it."""
 
 import copy
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -86,7 +87,10 @@ class HeadSubject:
 
     def values(self, *batch: int) -> Tensor:
         """Return seeded targets of the contract row, (*batch, *event)."""
-        return values(self.row.target, batch)
+        if self.row.values is None:
+            return values(self.row.target, batch)
+        targets = self.row.values(math.prod(batch))
+        return targets.reshape(*batch, *self.row.target.event_shape)
 
     def draws(self) -> bool:
         """Return true if log_prob draws random numbers, that is, if it differs between seeds for the same inputs."""

@@ -155,9 +155,20 @@ def _number_types(subject: HeadSubject, worst: Worst) -> None:
             worst.same(
                 f"log_prob of {input_dtype} raw parameters", density.log_prob(value).dtype, result_dtype
             )
-            worst.finite(f"log_prob of {input_dtype} raw parameters", density.log_prob(value))
+            _require_possible(worst, f"log_prob of {input_dtype} raw parameters", density.log_prob(value))
             if value.is_floating_point():
                 worst.same(f"samples of {input_dtype} raw parameters", density.sample().dtype, result_dtype)
+
+
+def _require_possible(worst: Worst, label: str, log_prob: Tensor) -> None:
+    """Check that log_prob is finite; the finding of a density of 0 says how to check a head of such densities."""
+    hint = (
+        "; the density is 0 for some targets: list targets for which it is not in HeadRow.values"
+        if bool((log_prob == -math.inf).any())
+        else ""
+    )
+    bad = ~log_prob.isfinite()
+    worst.count(bad, f"{label}: {int(bad.sum())} of {log_prob.numel()} not finite{hint}")
 
 
 def _refuses_non_finite(subject: HeadSubject, worst: Worst) -> None:
@@ -328,7 +339,7 @@ def _finite_anywhere(subject: HeadSubject, worst: Worst) -> None:
             where = f"{str(dtype)[6:]}, raw parameters of size {size:.3g}"
             with torch.no_grad():
                 density = head.eval()(raw)
-                worst.finite(f"log_prob: {where}", density.log_prob(value))
+                _require_possible(worst, f"log_prob: {where}", density.log_prob(value))
                 worst.finite(f"mode: {where}", density.mode)
                 worst.finite(f"samples: {where}", density.sample())
             raw.requires_grad_()
@@ -382,7 +393,7 @@ def _calibrate_backwards(subject: HeadSubject, worst: Worst) -> None:
         worst.count(False, "log_prob draws random numbers")
         return
     raw, value = subject.raw_parameters(64), subject.values(64)
-    if value.is_floating_point() and subject.row.target.kind == "real":
+    if value.is_floating_point() and subject.row.target.kind == "real" and subject.row.values is None:
         value[32:] = 2 * value[32:]
     log_probs = []
     with torch.no_grad():

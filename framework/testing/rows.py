@@ -64,6 +64,8 @@ class HeadRow(Row):
         config: Parameters of the plugin.
         cases: Function from the head, in evaluation mode and float64, to reference cases; None where no reference is
             known.
+        values: Function from a number of samples to targets, (sample, *event), for a head whose density is 0 for some
+            real numbers, such as a head of positive numbers. None: random real numbers, at which no density may be 0.
         scale: Standard deviation of random raw parameters. Densities of three numbers, and densities whose log_prob
             draws random numbers, are integrated only at this scale; it must make them broad enough for a grid, except
             if the three numbers are angles. All other densities are also integrated at scales from 1e-2 to 1e3.
@@ -73,6 +75,7 @@ class HeadRow(Row):
     config: Mapping[str, Any] = field(default_factory=dict)
     cases: Callable[[DensityHead], Iterable[Case]] | None = None
     scale: float = 1.0
+    values: Callable[[int], Tensor] | None = None
 
 
 @dataclass(frozen=True)
