@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -24,6 +24,8 @@ from plugins.data.image_folder.corruption import Corrupted, Corruption
 from plugins.data.image_folder.labelled import LabelledImages, Loaded, find_folder
 from plugins.data.image_folder.policy import Policy, require_package, vary_images
 
+Centre = Literal["image", "mass"]
+"""Point about which an image is turned."""
 Jitter = Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)]
 
 
@@ -174,20 +176,31 @@ class TurnedImages(LabelledData):
     the corners would reveal the angle. Each image of the validation or test split has one angle, which never changes. A
     training image is turned by a new angle in every epoch.
 
+    If the subjects of all images lie to the same side of the centre, even by half a pixel, the place of the subject in
+    the turned image reveals the angle. `centre="mass"` turns each image about its centre of mass, which lies in the
+    middle of the turned image.
+
     Args:
         root: Folder of the images. It holds folders that are named by class, perhaps within folders train, validation
             and test; or idx files such as train-images-idx3-ubyte.gz, with the files of their labels.
         labelled: Settings of the images and their labels.
         jitter: Largest share by which training images are shifted, scaled and made brighter or darker.
+        centre: Point about which an image is turned: "image", its middle, or "mass", its centre of mass.
     """
 
     fewest = 1
     predicts_classes = False
 
     def __init__(
-        self, *, root: FilePath | None = None, labelled: LabelledImages, jitter: Jitter = 0.0
+        self,
+        *,
+        root: FilePath | None = None,
+        labelled: LabelledImages,
+        jitter: Jitter = 0.0,
+        centre: Centre = "image",
     ) -> None:
         super().__init__(root, labelled, jitter)
+        self.centre: Centre = centre
 
     def prepare(self) -> None:
         loaded = self.labelled.load(find_folder(self.root), self._choose_angles, self.fewest, self._trained)
@@ -195,7 +208,7 @@ class TurnedImages(LabelledData):
         self.target = Target("angle", ("turn",))
         self.groups = loaded.classes
         self._upright = loaded.splits["train"]
-        self._splits = Splits(**{split: Turned(table) for split, table in loaded.splits.items()})
+        self._splits = Splits(**{split: Turned(table, self.centre) for split, table in loaded.splits.items()})
 
     def _choose_angles(self, labels: Int[Tensor, "samples"], split: str) -> dict[str, Tensor]:
         """Return an angle for each sample, uniform in [-π, π), and its class as its group."""
@@ -204,10 +217,14 @@ class TurnedImages(LabelledData):
         return {"target": torch.from_numpy(turns.astype(np.float32)), "group": labels}
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        return Turned(super().read(files))
+        return Turned(super().read(files), self.centre)
 
     def inputs(self, user_data: Any) -> Tensor:
-        return keep_disc(super().inputs(user_data))
+        inputs = super().inputs(user_data)
+        items = user_data if isinstance(user_data, list | tuple) else [user_data]
+        if all(isinstance(item, str | Path) for item in items):  # files, which `read` has centred
+            return inputs
+        return stand_upright(inputs, self.centre)
 
     def augment(self, batch: Batch) -> Batch:
         angles = (2 * torch.rand(len(batch["target"]), dtype=torch.float32) - 1) * math.pi
@@ -215,7 +232,11 @@ class TurnedImages(LabelledData):
         if self.jitter:
             upright = images.augment(upright, torch.zeros(len(upright), dtype=torch.bool), self.jitter)
         angles = angles.to(batch["target"])
-        return {**batch, "input": turn(upright, angles), "target": angles[:, None]}
+        turned = turn(upright, angles, find_centres(upright, self.centre))
+        return {**batch, "input": turned, "target": angles[:, None]}
+
+    def fingerprint(self) -> Mapping[str, str]:
+        return {**super().fingerprint(), **({} if self.centre == "image" else {"centre": self.centre})}
 
 
 class Turned(FetchedInBatches):
@@ -223,33 +244,71 @@ class Turned(FetchedInBatches):
 
     Args:
         upright: Data set of upright images.
+        centre: Point about which an image is turned, as in `TurnedImages`.
     """
 
-    def __init__(self, upright: Dataset[Batch]) -> None:
+    def __init__(self, upright: Dataset[Batch], centre: Centre) -> None:
         self.upright = upright
+        self.centre: Centre = centre
 
     def __len__(self) -> int:
         return len(self.upright)  # type: ignore[arg-type]
 
     def __getitems__(self, indices: Sequence[int]) -> Batch:
         batch = fetch(self.upright, indices)
+        pixels = batch["input"]
         if "target" not in batch:
-            return {**batch, "input": keep_disc(batch["input"])}
-        return {**batch, "input": turn(batch["input"], batch["target"][:, 0])}
+            return {**batch, "input": stand_upright(pixels, self.centre)}
+        return {**batch, "input": turn(pixels, batch["target"][:, 0], find_centres(pixels, self.centre))}
+
+
+def stand_upright(
+    pixels: Shaped[Tensor, "batch channels side side"], centre: Centre
+) -> Shaped[Tensor, "batch channels side side"]:
+    """Return images as `turn` returns them for the angle 0."""
+    if centre == "image":
+        return keep_disc(pixels)
+    return turn(pixels, torch.zeros(len(pixels), device=pixels.device), find_centres(pixels, centre))
+
+
+def find_centres(
+    pixels: Shaped[Tensor, "batch channels side side"], centre: Centre
+) -> Float[Tensor, "batch 2"] | None:
+    """Return (x, y) of the centre of mass of each image, in units of half a side from the middle; y counts downwards.
+
+    The mass of a pixel is the distance of its brightness from that of the background, which is the median of the
+    outermost pixels. An image of one brightness has its centre of mass in the middle.
+
+    Returns:
+        The centres of mass, or None if `centre` is "image".
+    """
+    if centre == "image":
+        return None
+    brightness = pixels.float().mean(1)
+    edges = [brightness[:, 0], brightness[:, -1], brightness[:, 1:-1, 0], brightness[:, 1:-1, -1]]
+    mass = (brightness - torch.cat(edges, 1).median(1).values[:, None, None]).abs()
+    side = pixels.shape[-1]
+    place = (2 * torch.arange(side, device=pixels.device) - side + 1) / side
+    moments = torch.stack([(mass * place).sum((1, 2)), (mass * place[:, None]).sum((1, 2))], 1)
+    return moments / mass.sum((1, 2)).clamp(min=torch.finfo(mass.dtype).tiny)[:, None]
 
 
 def turn(
-    pixels: Shaped[Tensor, "batch channels side side"], angles: Float[Tensor, "batch"]
+    pixels: Shaped[Tensor, "batch channels side side"],
+    angles: Float[Tensor, "batch"],
+    centres: Float[Tensor, "batch 2"] | None = None,
 ) -> Shaped[Tensor, "batch channels side side"]:
     """Turn images counter-clockwise about their centres, with linear interpolation, and keep only the disc inside.
 
     Args:
         pixels: Square images; integers are rounded.
         angles: Angle of each image, radians.
+        centres: Points that are turned into the middle of the result (`find_centres`); None: the middle of the image.
     """
-    cosine, sine, zero = angles.cos(), angles.sin(), torch.zeros_like(angles)
+    cosine, sine = angles.cos(), angles.sin()
+    x, y = (torch.zeros_like(angles),) * 2 if centres is None else centres.to(angles).unbind(1)
     # Rows count downwards: a pixel of the result is read from the image at its position turned clockwise.
-    rows = [torch.stack([cosine, -sine, zero], -1), torch.stack([sine, cosine, zero], -1)]
+    rows = [torch.stack([cosine, -sine, x], -1), torch.stack([sine, cosine, y], -1)]
     grid = functional.affine_grid(torch.stack(rows, 1), list(pixels.shape), align_corners=False)
     values = pixels if pixels.is_floating_point() else pixels.float()
     turned = functional.grid_sample(values, grid.to(values), padding_mode="border", align_corners=False)

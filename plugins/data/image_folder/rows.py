@@ -81,8 +81,8 @@ ROWS = {
         replace(
             IDX,
             name="idx files, jittered",
-            config={"image_size": 12, "jitter": 0.1},
-            changes={"classes": ["0"]},
+            config={"image_size": 12, "jitter": 0.1, "centre": "mass"},
+            changes={"classes": ["0"], "centre": "image"},
         ),
     ),
 }

@@ -15,7 +15,7 @@ import pytest
 import torch
 from kornia.geometry.transform import rotate
 from PIL import Image
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import center_of_mass, gaussian_filter
 
 from framework.configuration.schema import build, resolve
 from framework.data import Batch, Data
@@ -23,7 +23,7 @@ from framework.datasets.fields import fetch
 from framework.errors import ConfigError, DataError, UserError
 from framework.testing.data_samples import prepared
 from plugins.data.image_folder.corruption import CORRUPT, STRENGTHS
-from plugins.data.image_folder.data import keep_disc, turn
+from plugins.data.image_folder.data import find_centres, keep_disc, turn
 from plugins.data.image_folder.idx import read_idx
 from plugins.data.image_folder.rows import write_folders, write_idx, write_table
 
@@ -207,6 +207,39 @@ def test_turned_images_have_the_angle_of_their_target(tmp_path: Path) -> None:
         assert error.abs().max() < 0.01
     again = prepared("turned_images", root=str(tmp_path), image_size=33, grayscale=True)
     assert torch.equal(fields_of(again, "test")["input"], fields_of(data, "test")["input"])
+
+
+@pytest.mark.parametrize("background", [0, 200])
+def test_a_centre_of_mass_is_turned_into_the_middle(background: int) -> None:
+    """An L off the middle looks like the L turned about the middle, and SciPy finds its centre of mass there."""
+    upright = torch.full((1, 1, 41, 41), float(background))
+    upright[..., 12:22, 20:23] = 100
+    upright[..., 20:22, 23:29] = 100
+    centres = find_centres(upright, "mass")
+    assert centres is not None
+    mass = (upright[0, 0] - background).abs().numpy()
+    expected = (np.array(center_of_mass(mass))[::-1] - 20) / 20.5  # (x, y), in units of half a side
+    np.testing.assert_allclose(centres[0], expected, atol=1e-5)
+    for angle in (0.0, 0.7, 3.0):
+        turned = turn(upright - background, torch.tensor([angle]), centres)[0, 0].abs()
+        np.testing.assert_allclose(center_of_mass(turned.numpy()), (20, 20), atol=0.05)
+    blank = torch.full((2, 3, 9, 9), 7, dtype=torch.uint8)
+    assert torch.equal(find_centres(blank, "mass"), torch.zeros(2, 2))
+
+
+def test_an_image_that_is_predicted_is_centred_like_turned_images(tmp_path: Path) -> None:
+    picture = np.zeros((33, 33), np.uint8)
+    picture[4:16, 6:12] = 255
+    (tmp_path / "a").mkdir()
+    for number in range(30):
+        Image.fromarray(picture).save(tmp_path / "a" / f"{number}.png")
+    data = prepared("turned_images", root=str(tmp_path), image_size=33, grayscale=True, centre="mass")
+    test = fields_of(data, "test")
+    read = fetch(data.read([tmp_path / "a" / "0.png"]), [0])["input"]
+    assert torch.equal(read, data.inputs(torch.from_numpy(picture)[None, None]))
+    for table in (test["input"], data.augment(fields_of(data, "train"))["input"], read):
+        for pixels in table[:, 0].numpy():
+            np.testing.assert_allclose(center_of_mass(pixels), (16, 16), atol=0.05)
 
 
 def test_corruptions_have_the_strength_that_they_state() -> None:
