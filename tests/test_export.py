@@ -407,12 +407,22 @@ def test_an_exported_network_computes_the_same_parameters(name: str, tmp_path: P
     assert all(time > 0 for forms in times.values() for time in forms.values())
 
 
+def require_no_origin(folder: Path) -> None:
+    """Check that no file of an exported folder names a place, or holds a line of code, of the machine that exports."""
+    for file in folder.iterdir():
+        content = file.read_bytes()
+        for name in (str(Path(__file__).parents[1]), sys.prefix, str(folder.parent)):
+            assert name.encode() not in content, f"{file.name}: {name}"
+    assert not re.search(rb"\.py\", line \d", (folder / "model.onnx").read_bytes())  # of a stack trace
+
+
 def check_export(name: str, row: HeadRow, into: Path) -> Mapping[str, Any]:
     """Export a model with this head, see that the differences are small, and return its description."""
     model, shape = model_of(name, row)
     content = exporting.export(model, describe(shape, row.target), into)
     require_parity(content)
     require_no_other_imports(into)
+    require_no_origin(into)
     return content
 
 
@@ -571,6 +581,7 @@ def test_every_encoder_is_exported_or_refused_with_its_reason(name: str, tmp_pat
         if words is None:
             content = exporting.export(model, description, into)
             require_parity(content)
+            require_no_origin(into)
         else:
             with pytest.raises(ConfigError, match=words):
                 exporting.export(model, description, into)

@@ -40,14 +40,31 @@ def quiet_export() -> Iterator[None]:
 def write_onnx(
     program: torch.export.ExportedProgram, inputs: Sequence[str], outputs: Sequence[str], file: Any
 ) -> None:
-    """Write a traced program as ONNX, with names of its inputs and outputs."""
+    """Write a traced program as ONNX, with names of its inputs and outputs.
+
+    The file holds no notes of PyTorch on the origin of each operation, which contain paths and lines of source code of
+    the machine that exports.
+    """
     # a density may draw an empty sample to learn its type; ONNX has no form for such draws
     _remove_unused(program.graph_module)
     written = torch.onnx.export(
         program, input_names=list(inputs), output_names=list(outputs), verbose=False, optimize=True
     )
     assert written is not None
+    _remove_notes(written.model)
     written.save(file)
+
+
+def _remove_notes(model: Any) -> None:
+    """Remove the metadata of a model of onnxscript's intermediate representation, of its graphs and of their parts."""
+    graphs = [model.graph, *model.functions.values()]
+    nodes = [node for graph in graphs for node in graph.all_nodes()]
+    values = [value for node in nodes for value in (*node.inputs, *node.outputs) if value is not None]
+    interface = [value for graph in graphs for value in (*graph.inputs, *graph.outputs)]
+    initializers = model.graph.initializers.values()
+    for part in (model, *graphs, *nodes, *values, *interface, *initializers):
+        part.metadata_props.clear()
+        part.doc_string = None
 
 
 def _remove_unused(traced: GraphModule) -> None:
