@@ -88,8 +88,8 @@ def concentration_of_moments(resultant: Tensor, deviation: Tensor) -> Tensor:
         error = torch.log1p((have - wanted) / wanted.clamp(min=tiny))
         slope = concentration * mean_resultant_slope(concentration) / have
         step = error / torch.where(spread_out, slope, -slope)
-        # κ = 0 and infinity have no finite logarithm; they are exact already
-        step = torch.where((concentration > 0) & concentration.isfinite(), step, 0)
+        # κ = 0 and infinity have no finite logarithm, and above 1e100 the slope underflows; these are exact already
+        step = torch.where((concentration > 0) & (concentration < 1e100), step, 0)
         concentration = concentration * torch.exp(-step)
     return concentration
 

@@ -472,6 +472,16 @@ def test_concentration_of_moments_inverts_the_moments(concentration):
     assert functions.concentration_of_moments(*moments).item() == pytest.approx(concentration, rel=1e-12)
 
 
+@pytest.mark.parametrize("power", range(-307, 0, 17))
+def test_concentration_of_moments_is_finite_for_every_deviation(power):
+    """For a small deviation V, κ = 1/2V + 1/4 + O(V) (Mardia & Jupp 2000, 5.3.10)."""
+    deviation = torch.tensor(10.0**power, dtype=torch.float64)
+    concentration = functions.concentration_of_moments(1 - deviation, deviation)
+    assert concentration.item() == pytest.approx(
+        (0.5 / deviation + 0.25).item(), rel=max(deviation.item(), 1e-12)
+    )
+
+
 def test_concentration_of_moments_at_its_ends():
     concentration = functions.concentration_of_moments(
         torch.tensor([0.0, -0.4, 1.0]), torch.tensor([1.0, 1.4, 0.0])
