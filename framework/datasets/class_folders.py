@@ -106,6 +106,11 @@ def list_files(
                     f"data.root = {root}: The folder {path.name} holds further folders ({', '.join(inner_names)})."
                     f"{_suggest_split([path.name])} {remedy}"
                 )
+        if not by_split and len(folders) > 1 and all(path.name.lower() in OTHER_NAMES for path in folders):
+            raise DataError(
+                f"data.root = {root}: The folders {', '.join(path.name for path in folders)} have the names of splits, "
+                f"but hold no folders of classes. {remedy}"
+            )
         splits = ("test", "train") if by_split else ("",)
         folders_of_class = [(path.name, split, path / split) for path in folders for split in splits]
     classes = sorted({name for name, _, _ in folders_of_class})

@@ -198,6 +198,27 @@ def test_other_layouts_are_refused(prepare_data, tmp_path):
 
 
 @pytest.mark.parametrize(
+    "names, message",
+    [
+        (
+            ("Train", "Test"),
+            "The folders Test, Train have the names of splits, but hold no folders of classes",
+        ),
+        (("training", "val", "eval"), "The folders eval, training, val have the names of splits"),
+        (
+            ("caf\u00e9", "cafe\u0301"),
+            r"The classes 'cafe\\u0301' and 'caf\\xe9' look the same \('caf\u00e9'\)",
+        ),
+    ],
+)
+def test_folders_that_are_no_different_classes_are_refused(prepare_data, tmp_path, names, message):
+    for name in names:
+        cloud_file(tmp_path / name / "1.xyz")
+    with pytest.raises(DataError, match=message):
+        prepare_data(root=tmp_path)
+
+
+@pytest.mark.parametrize(
     "folder, message",
     [
         ("val", "holds a folder val beside .* Rename the folder val to validation"),
