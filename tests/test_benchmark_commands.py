@@ -67,7 +67,7 @@ def test_a_command_that_fails_is_an_error_and_handlers_are_as_before() -> None:
     assert [signal.getsignal(number) for number in NUMBERS] == before
 
 
-TIMED = {"main_job.py", "predict.py", "step_overhead.py", "stores.py"}
+TIMED = {"cold_start.py", "main_job.py", "predict.py", "step_overhead.py", "stores.py"}
 """Scripts that time single commands, in temporary folders, of which nothing is left if they are stopped."""
 
 
