@@ -291,7 +291,8 @@ def floor_section() -> str:
             "sum of all coordinates, which only reads them (`torch.Tensor.sum`), in the same run. Times are processor "
             "milliseconds per cloud on one core: the median of 5 interleaved rounds (least to largest), with three "
             "clouds in a call. The last column is the speed-up of two threads over one, as in the section "
-            "`Two threads`: by processor time, and in brackets by wall time.",
+            "`Two threads`: by processor time, and in brackets by wall time. The numbers called *wanted* are the aims "
+            "for the search.",
             "",
             "| points | basis points | search, ms | wanted, ms | packing alone, ms | reading alone, ms | two threads "
             "(wanted: 1.9) |",

@@ -143,7 +143,7 @@ def simple_readings(root: Path, digits: Sequence[str], centre: str) -> Readings:
     usual = torch.atan2(direction[:first].sin().mean(), direction[:first].cos().mean())
     queries = images[first:].flatten(1)
     nearest = torch.full((len(queries),), math.inf)
-    neighbour, seen = torch.empty(len(queries), dtype=torch.int64), torch.empty(len(queries))
+    neighbour, neighbour_angle = torch.empty(len(queries), dtype=torch.int64), torch.empty(len(queries))
     for step in range(TURNS):
         turn_by = 2 * math.pi * step / TURNS
         turned = turn(images, torch.full((len(images),), turn_by)).flatten(1)
@@ -152,10 +152,10 @@ def simple_readings(root: Path, digits: Sequence[str], centre: str) -> Readings:
         least, index = distance.min(1)
         closer = least < nearest
         nearest[closer], neighbour[closer] = least[closer], index[closer]
-        seen[closer] = angle[index[closer]] + turn_by
+        neighbour_angle[closer] = angle[index[closer]] + turn_by
     return Readings(
         angular_distance(direction[first:], usual),
-        angular_distance(seen, angle[first:]),
+        angular_distance(neighbour_angle, angle[first:]),
         digit[neighbour] != digit[first:],
     )
 
@@ -170,12 +170,16 @@ def cue_text(root: Path) -> str:
     wrong: dict[str, Tensor] = {}
     for digits in (AMBIGUOUS, PAIR):
         for centre, name in CENTRES.items():
-            found = simple_readings(root, digits, centre)
-            columns = [found.place_error <= NEAR, found.neighbour_error >= math.pi - NEAR, found.wrong_digit]
+            readings = simple_readings(root, digits, centre)
+            columns = [
+                readings.place_error <= NEAR,
+                readings.neighbour_error >= math.pi - NEAR,
+                readings.wrong_digit,
+            ]
             lines.append(
                 f"| {', '.join(digits)} | {name} | {' | '.join(share(column) for column in columns)} |"
             )
-            wrong[centre] = found.wrong_digit.double()  # of PAIR in the end
+            wrong[centre] = readings.wrong_digit.double()  # of PAIR in the end
     error, spread = float(wrong["image"].mean()), float(wrong["image"].std() / len(wrong["image"]) ** 0.5)
     table = "\n".join(lines)
     verdict = "cannot reach" if 2 * (error + 2 * spread) < READING else "may reach"
@@ -184,8 +188,8 @@ the middle of the image and below it. Each image is turned about its middle (`da
 digit turns with it. Two rules without a trained model show that this small offset reveals the angle. The first rule
 takes only the direction from the middle to the centre of mass. The second rule takes the angle and the digit of the
 most similar other image, after each of them is turned by {TURNS} angles. If images are turned about their centres of
-mass (`data.centre=mass`), this cue is missing. The table gives shares of the validation and test images, and ± is their
-standard error.
+mass (`data.centre=mass`), little of this cue is left. The table gives shares of the validation and test images, and ±
+is their standard error.
 
 {table}
 
@@ -195,16 +199,17 @@ The share of wrong digits limits the mass of the other reading of a 6 or 9. If a
 9 with probability 1 - p, the other reading has the mean mass 2 p (1 - p) under the exact density. This is at most twice
 the smallest error of any rule, min(p, 1 - p), and so at most twice the error of this rule. With very many images, the
 error of this rule itself tends to 2 p (1 - p) (Cover & Hart 1967). For images that are turned about their middle, the
-mass is thus at most {2 * error:.3f} ± {2 * spread:.3f}. There, a calibrated density {verdict} the aim of {READING} as
-a mean over the images. The reason is the offset, and not the shape of the digits.
+mass of the other reading is thus at most {2 * error:.3f} ± {2 * spread:.3f}. For such images, a calibrated
+density {verdict} the aim of {READING} as a mean over the images. The reason is the offset, and not the shape
+of the digits.
 
 {machine("torch", "numpy")}
 Command: `python -m benchmarks.images.digits page --section cue <folder>`."""
 
 
-def share(found: Tensor) -> str:
+def share(is_true: Tensor) -> str:
     """Return the share of images for which a statement is true, with its standard error, in percent."""
-    values = 100 * found.double()
+    values = 100 * is_true.double()
     return f"{float(values.mean()):.1f} ± {float(values.std()) / len(values) ** 0.5:.1f} %"
 
 

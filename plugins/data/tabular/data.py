@@ -54,9 +54,9 @@ class Tabular(Data):
             table test rows, for a model that was trained on another table.
         data_seed: Seed of the choice of these rows, independent of the seed of the run.
         missing: Treatment of rows without a number or a label. "error" refuses them, "skip" leaves them out. "median"
-            fills missing inputs with the median of the training rows, adds a column `name=` that is 1 where a number of
-            the column `name` is missing, if some are missing in the training rows, and leaves out rows without a
-            target.
+            fills missing inputs with the median of the training rows, and leaves out rows without a target. For each
+            column with missing numbers in the training rows, it adds a column `name=`, which is 1 where a number of the
+            column `name` is missing.
         small_angles: Whether angles in degrees may all lie within ±2π; by default this is refused, because such angles
             look like radians.
         words: Treatment of columns of words. "leave_out" does not read them; "levels" reads a column of 0 and 1 for

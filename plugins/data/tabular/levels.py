@@ -1,4 +1,4 @@
-"""Columns of 0 and 1: one for each level of a column of words, and one that says where a column of numbers has holes.
+"""Columns of 0 and 1: one for each level of a column of words, and one for each column of numbers with missing cells.
 
 A level is a word that occurs in a column. The empty level marks missing cells: the column `age=` is 1 where the column
 `age` holds no number.
@@ -133,7 +133,7 @@ def _levels(cells: Columns, name: str) -> Counter[str]:
 
 
 def _indicator(words: Sequence[str], level: str, missing: Collection[str] = ()) -> list[str]:
-    """Return 1 for each cell that holds the level, or for the empty level for each missing cell, and 0 for others."""
+    """Return 1 for each cell that holds the level, and 0 for others; for the empty level, 1 for each missing cell."""
     if not level:
         return ["1" if word.lower() in missing else "0" for word in words]
     return ["1" if word == level else "0" for word in words]

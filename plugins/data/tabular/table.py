@@ -382,9 +382,10 @@ def fill_missing(
 def _mark_holes(
     cells: Columns, columns: tuple[str, ...], inputs: np.ndarray, training: np.ndarray
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    """Return columns and inputs with a further column for each column with holes in the training rows, and the medians.
+    """Return columns and inputs with a mark of missing numbers for each column that needs one, and the medians.
 
-    The further column `name=` is 1 where a number is missing, and 0 elsewhere.
+    The mark of a column is a further column, `name=`, which is 1 where a number is missing, and 0 elsewhere. A column
+    needs one if numbers are missing in the training rows.
 
     Args:
         cells: The table.
