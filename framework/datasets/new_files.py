@@ -145,9 +145,9 @@ def index_labels(
     Raises:
         DataError: A label is not a class of the trained model.
     """
-    found = set(labels)
-    classes = trained.classes if trained is not None and trained.classes else tuple(sorted(found))
-    unknown = sorted(found - set(classes))
+    present = set(labels)
+    classes = trained.classes if trained is not None and trained.classes else tuple(sorted(present))
+    unknown = sorted(present - set(classes))
     if unknown:
         raise DataError(
             f"{source}: The model does not know the class {quote(unknown[0])}.{did_you_mean(unknown[0], classes)} Its "
