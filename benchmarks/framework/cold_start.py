@@ -163,9 +163,9 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
             f"evaluation of the von Mises density takes {compiled['von_mises']} s, also because it compiles.",
             "",
             f"Before the rounds, other processes used {median_and_range([row['others'] for row in rows], 2)} of 2 "
-            "cores. Such work lengthens wall times several times over, and processor times by a share. The limit of "
-            f"{LIMIT} s is for a machine without other work; beside such work, the difference of the main process is "
-            f"{'above' if own > LIMIT else 'below'} it.",
+            "cores. Such work multiplies wall times, and lengthens processor times less. The limit of "
+            f"{LIMIT} s is for a machine without other work. With such work, the additional processor time of the main "
+            f"process is {'above' if own > LIMIT else 'below'} {LIMIT} s.",
             "",
             f"{machine('numba', 'torch', 'pytorch-lightning')} Command: `python -m benchmarks.framework.cold_start`.",
             "",

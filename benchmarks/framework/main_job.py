@@ -259,9 +259,8 @@ def floor_section(rows: Sequence[dict[str, Any]]) -> list[str]:
         "processor time of a step on one thread, and of the parts that a step consists of; each row contains the "
         "rows above it. The convolutions are those of PyTorch, called with random numbers of the shapes that they "
         f"get in training. Each number is the median of {FLOOR_ROUNDS} rounds (least to largest), in which the rows "
-        f"are measured one after the other. The times of all {FULL * STEPS:,} steps follow from these numbers. What "
-        "the command needs beyond the last row are its start, the reading of images, validations, the test and "
-        "figures.",
+        f"are measured one after the other. The times of all {FULL * STEPS:,} steps follow from these numbers. The "
+        "command also needs time for its start, the reading of images, validations, the test and figures.",
         "",
         "| part of a step | 32-true, ms | all steps, s | bf16-mixed, ms | all steps, s |",
         "|---|---:|---:|---:|---:|",
@@ -278,7 +277,7 @@ def floor_section(rows: Sequence[dict[str, Any]]) -> list[str]:
         *lines,
         "",
         "The project wants the main job in 60 s of wall time and 120 s of processor time. A faster framework cannot "
-        "reach 60 s on one core: a plain loop takes longer, and in `32-true` the convolutions alone do.",
+        "reach 60 s on one core: a plain loop takes longer, and in `32-true` the convolutions alone take longer too.",
         "",
         "Before the rounds, other processes used "
         f"{median_and_range([row['others'] for row in rows], 2)} cores, which lengthens processor times.",

@@ -63,10 +63,10 @@ def floor_section() -> str:
         [
             "A separate process writes to the store, and no run that uses MLflow can save the import of MLflow in this "
             "process. The first run also creates the store, with all migrations of MLflow's database; later runs find "
-            "it. This table gives the processor time that a store adds to the run above, if it is created in the run "
-            "and if it exists, and the time of the separate process if it imports MLflow and ends. The project wants "
-            f"at most 2 s. Each number is the median of {FLOOR_ROUNDS} rounds (least to largest), in which all are "
-            "measured one after the other.",
+            "it. This table gives the processor time that a store adds to the run above: first if the run creates the "
+            "store, then if the store exists. The last row is the time of the separate process if it imports MLflow "
+            f"and ends. The project wants a store to add at most 2 s. Each number is the median of {FLOOR_ROUNDS} "
+            "rounds (least to largest), in which all are measured one after the other.",
             "",
             "| part | processor time, s |",
             "|---|---:|",
