@@ -334,6 +334,15 @@ STORE_NOTE = (
 """Paragraph of the page on the fault in which MLflow's own database was incomplete."""
 
 
+COMMIT_NOTE = (
+    "Four kills of jobs with a table (commit dd7d5cf4) were first compared with an undisturbed command of an older "
+    "commit, which fits temperatures differently, and the temperatures and likelihoods differed. An undisturbed "
+    "command of commit dd7d5cf4 gave the same weights and numbers as the killed ones, so these kills count as "
+    "equal. Since commit 1ad97d7d, the test repeats the undisturbed commands at each new commit."
+)
+"""Paragraph of the page on results that were compared with those of an older commit."""
+
+
 def page(soak: Soak, kinds: list[Soaked]) -> str:
     """Return the page of a soak test."""
     counts = soak.counts
@@ -387,6 +396,8 @@ def page(soak: Soak, kinds: list[Soaked]) -> str:
             f"Faults: {'; '.join(counts.faults) or 'none'}.",
             "",
             *([STORE_NOTE, ""] if counts.events.get("the store and the run", [0, 0, 0])[2] else ()),
+            COMMIT_NOTE,
+            "",
             "The tests so far:",
             "",
             *(
