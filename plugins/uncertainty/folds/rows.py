@@ -10,6 +10,7 @@ SHORT = {"steps": 10, "epochs": 1}
 ROWS = {
     "folds": (
         WrapperRow("reals", REALS, {"folds": 2, **SHORT}),
+        WrapperRow("reals, narrowed", REALS, {"folds": 2, "sharpen": True, **SHORT}),
         WrapperRow("classes", CLASSES, {"folds": 3, **SHORT}),
         WrapperRow(
             "one angle, one group",

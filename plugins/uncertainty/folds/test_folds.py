@@ -3,9 +3,12 @@ import math
 import pytest
 import torch
 from torch import nn
+from torch.distributions import Independent, Normal
 
 from framework.calibration.validation import predict_densities
 from framework.configuration.schema import build, resolve
+from framework.distributions.density import Mixture
+from framework.distributions.tempering import temper
 from framework.errors import ConfigError
 from framework.model import Model
 from framework.target import Target
@@ -14,7 +17,7 @@ from framework.uncertainty import held_out
 from plugins.uncertainty.folds.chain import build_chain
 from plugins.uncertainty.folds.groups import Apart, Together
 from plugins.uncertainty.folds.training import Training, assign_folds
-from plugins.uncertainty.folds.wrapper import PSEUDO, fit_log_weights
+from plugins.uncertainty.folds.wrapper import PSEUDO, fit_log_weights, fit_model_share, pool_temperature
 
 TARGET = Target("real", ("y",), location=(3.0,), scale=(2.0,))
 SHORT = {"folds": 3, "steps": 40, "epochs": 1}
@@ -183,6 +186,87 @@ def test_weights_of_groups_have_the_highest_likelihood():
     assert fit_log_weights(torch.tensor([[0.0, -math.inf]] * 50).double()).exp()[1] > 0
 
 
+def simulated(share, groups=2, models=5, count=20_000):
+    """Return the locations of calibrated models, (sample, group, model), and targets, (sample, 1)."""
+    generator = torch.Generator().manual_seed(2)
+    draws = torch.randn(count, 1 + groups * models, dtype=torch.float64, generator=generator)
+    return math.sqrt(share) * draws[:, 1:].unflatten(1, (groups, models)), math.sqrt(1 - share) * draws[:, :1]
+
+
+def normals(locations):
+    return Independent(Normal(locations.unsqueeze(-1), torch.ones((*locations.shape, 1)).double()), 1)
+
+
+def pool_of(locations, weights):
+    models = locations.shape[-1]
+    log_weights = (weights / models).log().repeat_interleave(models)
+    return Mixture(log_weights.expand(len(locations), -1), normals(locations.flatten(1)))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.3])
+@pytest.mark.parametrize("weight", [0.5, 0.9])
+def test_a_narrowed_mixture_is_as_wide_as_the_errors_of_its_mean(share, weight):
+    """Compare the variance of mixtures with the squared errors of their means, which are drawn."""
+    locations, target = simulated(share)
+    weights = torch.tensor([weight, 1 - weight]).double()
+    temperature = pool_temperature(torch.tensor(share).double(), weights.log(), 5)
+    pool = temper(pool_of(locations, weights), temperature)
+    assert pool.variance.mean().item() == pytest.approx((target - pool.mean).square().mean().item(), rel=0.03)
+
+
+def test_one_model_is_not_narrowed():
+    assert pool_temperature(torch.tensor(0.3).double(), torch.zeros(1).double(), 1) == 1
+    assert pool_temperature(torch.tensor(0.0).double(), torch.tensor([0.5, 0.5]).double().log(), 5) == 1
+
+
+@pytest.mark.parametrize("groups", [2, 3])
+def test_the_share_of_the_models_follows_from_left_out_samples(groups):
+    locations, target = simulated(0.2, groups)
+    several = [
+        Mixture(torch.zeros(len(target), 1).double(), normals(part[:, :1])) for part in locations.unbind(1)
+    ]
+    share = fit_model_share([several], [{"target": target}])
+    assert 0.14 < share < 0.22
+    weights = torch.full((groups,), 1 / groups).double()
+    wide = pool_of(locations, weights)
+    narrow = temper(wide, pool_temperature(torch.tensor(share).double(), weights.log(), 5))
+    assert narrow.log_prob(target).mean() > wide.log_prob(target).mean() + 0.02
+    torch.manual_seed(0)
+    covered = [
+        (density.log_prob(density.sample((100,))) >= density.log_prob(target))
+        .double()
+        .mean(0)
+        .le(0.9)
+        .double()
+        .mean()
+        for density in (wide, narrow)
+    ]
+    assert covered[0] > 0.94 and abs(covered[1] - 0.9) < 0.02
+
+
+def test_models_that_agree_and_widths_that_are_wrong_do_not_narrow_the_mixture():
+    locations, target = simulated(0.0)
+    several = [
+        Mixture(torch.zeros(len(target), 1).double(), normals(part[:, :1])) for part in locations.unbind(1)
+    ]
+    for factor in (1.0, 0.7, 1.3):  # the models are calibrated, too wide, or too narrow
+        assert fit_model_share([several], [{"target": factor * target}]) == pytest.approx(0, abs=1e-9)
+
+
+def test_a_loaded_mixture_is_as_narrow_as_the_stored_one():
+    inputs, target = table(300)
+    wrapper = folds(steps=200, sharpen=True)
+    wrapper.train_models(inputs, target, seed=0, batch_size=32)
+    assert wrapper.model_share > 0 and "The mixture of all models has the temperature" in wrapper.remark
+    loaded = folds(steps=200, sharpen=True).eval()
+    loaded.load_state_dict(wrapper.state_dict())
+    log_prob = wrapper(inputs).log_prob(target)
+    assert torch.equal(loaded(inputs).log_prob(target), log_prob)
+    wide = folds(steps=200)
+    wide.train_models(inputs, target, seed=0, batch_size=32)
+    assert wide.model_share == 0 and not torch.equal(wide(inputs).log_prob(target), log_prob)
+
+
 def test_samples_that_are_nearly_impossible_are_reported():
     inputs, target = table()
     target[11] += 1e9
@@ -197,6 +281,8 @@ def test_samples_that_are_nearly_impossible_are_reported():
 def test_wrong_settings_are_refused():
     with pytest.raises(ConfigError, match="each needs one number for each group"):
         folds(dropout=[0.1])
+    with pytest.raises(ConfigError, match="and the number of groups is 1"):
+        folds(dropout=[0.1], weight_decay=[0.1], sharpen=True)
     with pytest.raises(ConfigError, match="needs at least 6 samples"):
         folds().train_models(*table(5), seed=0, batch_size=16)
 
