@@ -26,6 +26,12 @@ def test_names_that_look_the_same_are_refused_with_their_characters(name: str) -
     assert ascii(name) in str(raised.value)
 
 
+@pytest.mark.parametrize("name", ["1.0", "01", "+1", "1e0"])
+def test_the_same_number_in_different_notation_is_refused(name: str) -> None:
+    with pytest.raises(DataError, match=r"^table\.csv: The classes .* are the same number"):
+        compare_classes(["1", "2", name, "nan", "inf"], "table.csv")
+
+
 def test_names_that_differ_in_capital_letters_are_reported() -> None:
     (remark,) = compare_classes(["no", "yes", "No", "no"], "table.csv")
     assert remark.startswith("the classes 'No' and 'no' differ only in capital letters")

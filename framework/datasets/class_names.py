@@ -1,10 +1,11 @@
 """Names of the classes in a user's data: two names that look the same are refused, and similar ones are reported."""
 
+import math
 import unicodedata
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 
 from framework.errors import DataError, quote, shorten
-from framework.storage.text import INVISIBLE
+from framework.storage.text import INVISIBLE, parse_number
 
 
 def compare_classes(names: Iterable[str], place: str) -> tuple[str, ...]:
@@ -16,7 +17,7 @@ def compare_classes(names: Iterable[str], place: str) -> tuple[str, ...]:
 
     Raises:
         DataError: two names look the same, but differ in composed and decomposed letters, in invisible characters or in
-            blanks, so that they would be two classes.
+            blanks, so that they would be two classes; or two names are the same number in different notation.
     """
     different = sorted(set(names))
     alike = _first_equal(different, _as_seen)
@@ -24,6 +25,12 @@ def compare_classes(names: Iterable[str], place: str) -> tuple[str, ...]:
         raise DataError(
             f"{place}: The classes {alike[0]!a} and {alike[1]!a} look the same ({quote(_as_seen(alike[0]))}), but "
             "their characters differ, so they would be two classes. Write the name in the same way everywhere."
+        )
+    equal = _first_equal(different, _as_number)
+    if equal:
+        raise DataError(
+            f"{place}: The classes {quote(equal[0])} and {quote(equal[1])} are the same number. Write each class in "
+            "the same way everywhere."
         )
     similar = _first_equal(different, str.casefold)
     if not similar:
@@ -40,9 +47,15 @@ def _as_seen(name: str) -> str:
     return " ".join("".join(letter for letter in composed if letter not in INVISIBLE).split())
 
 
-def _first_equal(names: Iterable[str], key: Callable[[str], str]) -> tuple[str, str] | None:
+def _as_number(name: str) -> float | str:
+    """Return the finite number that a name represents, or the name itself."""
+    number = parse_number(name)
+    return name if number is None or not math.isfinite(number) else number
+
+
+def _first_equal(names: Iterable[str], key: Callable[[str], Hashable]) -> tuple[str, str] | None:
     """Return the first two names for which `key` returns the same; None if there are none."""
-    first: dict[str, str] = {}
+    first: dict[Hashable, str] = {}
     for name in names:
         if first.setdefault(key(name), name) != name:
             return first[key(name)], name
