@@ -3,7 +3,7 @@
 import hashlib
 import posixpath
 from collections.abc import Collection, Iterator
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Literal, cast
 
 from framework.datasets.class_folders import OTHER_NAMES
@@ -77,6 +77,12 @@ def list_files(table: Columns) -> Iterator[tuple[str, Split | None]]:
         if not name:
             raise DataError(
                 f"{table.file} line {number}: The column `{FILE}` is empty. Write the name of an image there."
+            )
+        if posixpath.isabs(name) or PureWindowsPath(path).is_absolute():
+            raise DataError(
+                f"{table.file} line {number}: {quote(path)} is an absolute path, but paths relative to data.root are "
+                "required. Remove the part of the path that is data.root, or set data.root to a folder that contains "
+                "all images."
             )
         if not is_within(name):
             raise DataError(

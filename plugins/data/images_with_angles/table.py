@@ -68,7 +68,7 @@ def read_table(
     chosen = _angle_columns(table, columns)
     values = {column: numbers(table, column, missing="").tolist() for column in chosen.names}
     for column in chosen.names:
-        _refuse_other_unit(file, column, np.array(values[column]), angles_in)
+        _refuse_other_unit(file, column, np.array(values[column]), angles_in, columns is None)
     to_radians = math.radians if angles_in != "radians" else float
     rows = [
         Row(
@@ -103,16 +103,27 @@ def _angle_columns(table: Columns, requested: Sequence[str] | None) -> ColumnCho
 
 
 def _refuse_other_unit(
-    file: Path, column: str, values: np.ndarray, angles_in: Literal["degrees", "radians"] | None
+    file: Path,
+    column: str,
+    values: np.ndarray,
+    angles_in: Literal["degrees", "radians"] | None,
+    chosen_by_content: bool,
 ) -> None:
+    """Refuse a column whose unit seems to be another one; it may also be no angle, if nobody named the column."""
+    no_angle = (
+        " If the column holds no angles, list the columns of angles in data.angle_columns."
+        if chosen_by_content
+        else ""
+    )
     wrong = unlike_degrees(values) if angles_in is None else ""
     if wrong:
         raise DataError(
             f"{file}, column {quote(column)}: {wrong}. Set data.angles_in=radians, or data.angles_in=degrees if "
-            "the angles are in degrees."
+            f"the angles are in degrees.{no_angle}"
         )
     wrong = unlike_radians(values) if angles_in == "radians" else ""
     if wrong:
         raise DataError(
-            f"{file}, column {quote(column)}: {wrong}. Leave data.angles_in out, or wrap the angles to one turn."
+            f"{file}, column {quote(column)}: {wrong}. Leave data.angles_in out, or wrap the angles to one "
+            f"turn.{no_angle}"
         )

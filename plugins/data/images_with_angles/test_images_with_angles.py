@@ -107,9 +107,11 @@ def table_with(line: str, header: str = "file,pan,tilt", index: int = 3) -> str:
         (table_with("001.png,3,4"), r"line 5: '001\.png' is already listed in line 3"),
         (table_with("../001.png,3,4"), r"line 5: '\.\./001\.png' lies outside of the folder of the data"),
         (table_with("a/../../001.png,3,4"), r"line 5: .* lies outside of the folder of the data"),
+        (table_with("C:/Users/me/001.png,3,4"), r"line 5: .* is an absolute path"),
+        (table_with("C:\\Users\\me\\001.png,3,4"), r"line 5: .* is an absolute path"),
         (
             table_with("/home/001.png,3,4"),
-            r"line 5: '/home/001\.png' lies outside .* set data\.root to a folder",
+            r"line 5: '/home/001\.png' is an absolute path, .* set data\.root to a folder",
         ),
         (table_with("./001.png,3,4"), r"line 5: '\./001\.png' is already listed in line 3"),
         (table_with("a/..//001.png,3,4"), r"line 5: 'a/\.\.//001\.png' is already listed in line 3"),
