@@ -168,8 +168,10 @@ def radians_table(values: Sequence[float]) -> str:
 def test_radians_are_noticed(tmp_path: Path) -> None:
     values = np.linspace(-3.1, 3.1, 40).round(4).tolist()
     message = r"looks like radians, but degrees are expected\. Set data\.angles_in=radians"
-    with pytest.raises(DataError, match=message):
+    with pytest.raises(DataError, match=rf"{message}.* list the columns of angles in data\.angle_columns"):
         prepare_data(write_folder(tmp_path, radians_table(values)))
+    with pytest.raises(DataError, match=rf"{message}.* if the angles are in degrees\.$"):
+        prepare_data(tmp_path, angle_columns=["pan"])
     for unit, factor in (("radians", 1.0), ("degrees", math.pi / 180)):
         data = prepare_data(tmp_path, angles_in=unit)
         targets = torch.cat([fields_of(data, split)["target"] for split in SPLITS])
