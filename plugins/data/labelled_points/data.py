@@ -28,6 +28,7 @@ from plugins.data.labelled_points.features import (
     Bases,
     Features,
     Scan,
+    check_reach,
     draw_bases,
     local_features,
     scan_code,
@@ -222,6 +223,8 @@ class LabelledPoints(Data):
                     f"{list(self.unlabelled)} names all their labels. Add scans, or correct data.unlabelled."
                 )
         scans = {name: [labelled[i][1] for i in part] for name, part in numbers.items()}
+        if self._trained is None:
+            check_reach(scans["train"], chosen["train"], self.features)
         scaling = self._trained or _fit_scaling(scans["train"], chosen["train"], self.features, seed)
         datasets = {
             name: Points(
@@ -369,7 +372,11 @@ def _fit_scaling(
     points = np.concatenate([scan.points for scan in scans])
     extents = np.stack([points.min(0), points.max(0)])
     bases = draw_bases(features, extents, stream(seed, "basis points"))
-    parts = [local_features(scan, part, features, bases) for scan, part in zip(scans, rows, strict=True)]
+    parts = [
+        local_features(scan, part, features, bases)
+        for scan, part in zip(scans, rows, strict=True)
+        if len(part)
+    ]
     table = np.concatenate(parts)
     location, scale = table.mean(0), table.std(0)
     code = np.stack([scan_code(scan, bases) for scan in scans])

@@ -71,7 +71,7 @@ ROWS = {
     "labelled_points": (
         DataRow(
             "ten scans",
-            {"neighbours": 4, "basis_points": 5, "points": 50},
+            {"neighbours": 4, "surrounding_points": 0, "basis_points": 5, "points": 50},
             write=folder,
             synthetic=False,
             files=files,
@@ -80,14 +80,14 @@ ROWS = {
         ),
         DataRow(
             "folders of splits",
-            {"neighbours": 2, "basis_points": 0, "surrounding_points": 3, "classes": None},
+            {"neighbours": 2, "surrounding_points": 3},
             write=folders_of_splits,
             synthetic=False,
             files=files,
         ),
         DataRow(
             "position only",
-            {"neighbours": 0, "basis_points": 0},
+            {"neighbours": 0, "surrounding_points": 0},
             write=folder,
             synthetic=False,
             files=files,

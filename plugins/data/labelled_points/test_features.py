@@ -41,7 +41,7 @@ def test_features_equal_those_of_all_pairs_of_points():
 
 def test_a_point_is_not_its_own_neighbour_where_many_points_are_at_one_place():
     points = np.array([[0.0, 0, 0]] * 5 + [[1.0, 0, 0]])
-    features = Features(neighbours=2, basis_points=0)
+    features = Features(neighbours=2, surrounding_points=0)
     values = local_features(Scan(points, "scan", 2), np.arange(6), features, NO_BASES)
     np.testing.assert_array_equal(columns(values, features, "distance"), [[0, 0]] * 5 + [[1, 1]])
 

@@ -69,9 +69,10 @@ def test_points_without_a_class_are_only_neighbours(scans):
     save(scans / "test" / "more.npz", points, label=labels)
     with pytest.raises(DataError, match=r"more.npz: a point has the label -1, .* are 2, 6\."):
         prepare(scans)
+    save(scans / "train" / "more.npz", points, label=np.full(60, -1))  # a scan without any sample
     data = prepare(scans, unlabelled=[-1])
     assert len(data.splits().test) == 120 + 50
-    assert data.remarks == ("left out: 10 points without a class, which are only neighbours",)
+    assert data.remarks == ("left out: 70 points without a class, which are only neighbours",)
 
 
 def test_without_folders_of_splits_whole_scans_are_drawn(tmp_path):
@@ -116,6 +117,14 @@ def test_a_bad_scan_is_refused_with_a_sentence(scans, points, label, words):
     save(scans / "train" / "bad.npz", points, label=label)
     with pytest.raises(DataError, match=words):
         prepare(scans)
+
+
+@pytest.mark.parametrize("reach", [0.05, 40.0])
+def test_a_reach_in_another_unit_is_refused(scans, reach):
+    words = rf"data.reach = {reach:g} does not fit the scans, whose points are 0\.\d+ apart and which extend over 1\d"
+    with pytest.raises(DataError, match=words):
+        prepare(scans, reach=reach)
+    prepare(scans, reach=reach, surrounding_points=0)
 
 
 def test_a_folder_without_enough_scans_is_refused(tmp_path):
