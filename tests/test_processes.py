@@ -39,7 +39,6 @@ NODES = {"strategy": "ddp", "devices": 1, "num_nodes": 2}
         (SRUN, {"devices": 1}, "srun has started 2 processes on 2 nodes"),
         ({**SRUN, "SLURM_NTASKS_PER_NODE": ""}, NODES, "Add --ntasks-per-node=1"),
         ({}, NODES, "no launcher has started this command on 2 nodes"),
-        ({}, {"strategy": "fsdp", "accelerator": "cpu"}, "Choose trainer.strategy=ddp"),
     ],
 )  # fmt: skip
 def test_processes_that_are_not_those_of_the_settings_are_refused(

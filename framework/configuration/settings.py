@@ -64,21 +64,16 @@ NotNegative = Annotated[int, Field(ge=0)]
 Count = Annotated[int, Field(strict=True, ge=1)]
 Flag = Annotated[bool, Field(strict=True)]
 Share = Annotated[Any, AfterValidator(_share)]
-_UNUSED = ("", "_find_unused_parameters_true", "_find_unused_parameters_false")
-_PLAIN = ("ddp", "ddp_spawn", "ddp_fork", "ddp_notebook")
 STRATEGIES = (
-    *("auto", "single_device", "fsdp", "fsdp_cpu_offload", "xla", "xla_debug", "single_xla", "single_tpu"),
-    *(
-        "deepspeed",
-        "deepspeed_stage_1",
-        "deepspeed_stage_2",
-        "deepspeed_stage_2_offload",
-        "deepspeed_stage_3",
-    ),
-    *("deepspeed_stage_3_offload", "deepspeed_stage_3_offload_nvme"),
-    *(f"{name}{end}" for name in _PLAIN for end in _UNUSED),
+    *("auto", "single_device", "ddp"),
+    *("ddp_find_unused_parameters_true", "ddp_find_unused_parameters_false"),
 )
-"""Names of the strategies that Lightning has registered."""
+"""Names of the strategies of Lightning with which a training works.
+
+Lightning has others: with ddp_fork and ddp_notebook the trained weights stay in the processes that trained them, and
+the run continues with the initial ones; ddp_spawn cannot copy the run to the other processes; and the framework has no
+checkpoints of models that are divided among devices (docs/processes.md).
+"""
 PRECISIONS = (
     *("32-true", "bf16-mixed", "16-mixed", "64-true", "bf16-true", "16-true", "transformer-engine"),
     *("transformer-engine-float16", "32", "16", "64", "bf16", 32, 16, 64),

@@ -42,10 +42,8 @@ def require_processes(trainer: Mapping[str, Any]) -> None:
         trainer: Settings of the trainer.
 
     Raises:
-        ConfigError: The numbers differ, nobody has started the other nodes or the other tasks of an allocation, or the
-            strategy needs a GPU and the processes have none.
+        ConfigError: The numbers differ, or nobody has started the other nodes or the other tasks of an allocation.
     """
-    _require_gpu_for_fsdp(trainer)
     launched, nodes = launched_processes(), trainer.get("num_nodes") or 1
     if launched is None:
         if nodes > 1 and not any(name in os.environ for name in OTHER_LAUNCHERS):
@@ -109,16 +107,3 @@ def _count_all_devices(accelerator: str | None) -> int:
     import torch
 
     return max(1, torch.cuda.device_count())
-
-
-def _require_gpu_for_fsdp(trainer: Mapping[str, Any]) -> None:
-    strategy = trainer.get("strategy")
-    if not str(strategy).startswith("fsdp"):
-        return
-    import torch
-
-    if trainer.get("accelerator") == "cpu" or not torch.cuda.is_available():
-        raise ConfigError(
-            f"trainer.strategy={strategy} divides a model among GPUs, and this training has none. Choose "
-            "trainer.strategy=ddp, which also trains on processors."
-        )
