@@ -61,3 +61,23 @@ def test_each_encoder_of_a_chain_is_fitted_to_the_features_of_those_before_it(
     assert torch.equal(stored[0].basis, fitted[0].basis)
     torch.testing.assert_close(stored[1].values, fitted[1].values)
     torch.testing.assert_close(stored[1].scores, fitted[1].scores)
+
+
+def test_the_first_encoder_of_each_model_is_fitted_although_it_is_trained(
+    framework: Framework, clouds: Path, tmp_path: Path
+) -> None:
+    settings = (
+        *("data=point_cloud_folder", f"data.root={clouds}", "density_head=categorical", "metric=[accuracy]"),
+        *("encoder.bps.basis=selected", "encoder.bps.learned=true", "encoder.bps.points=6", "batch_size=3"),
+        *("trainer.max_epochs=1", "logger=none", "pictures=false", "uncertainty=[ensemble]"),
+        *("uncertainty.ensemble.members=2", "encoder.mlp.widths=[4]"),
+    )
+    done = framework(*settings, "encoder=[bps,mlp]", "hydra.run.dir=run", folder=None)
+    assert done.code == 0, done.out
+    found = [module for module in load(str(tmp_path / "run")).modules() if type(module).__name__ == "BPS"]
+    plain = build(
+        "encoder", resolve("encoder", {"name": "bps", "points": 6}), input_shape=(41, 3), input_columns=()
+    )
+    assert len(found) == 2 and torch.equal(found[0].basis, found[1].basis)
+    assert not torch.equal(found[0].basis, plain.basis)
+    assert all(encoder.moved.abs().max() > 0 for encoder in found)

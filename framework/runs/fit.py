@@ -18,7 +18,7 @@ from framework.configuration.settings import TRAINER_OURS, CallbackSettings, Set
 from framework.data import Data
 from framework.encoder import FitsInputs
 from framework.errors import ConfigError
-from framework.model import FrozenFrontEnd, fitted_models, learns
+from framework.model import FrozenFrontEnd, Model, fitted_models, learns
 from framework.runs.job import PRUNED, RECORD
 from framework.runs.resuming import begin_again, blame_checkpoint, resume_arguments
 from framework.runs.run import PROFILE, RANGE_TEST, Run
@@ -96,11 +96,18 @@ def _fit_encoders(session: Session) -> None:
         ConfigError: such an encoder follows an encoder that is trained.
     """
     front = list(session.predictor.encoders) if isinstance(session.predictor, FrozenFrontEnd) else []
+    # the first encoder of a model is trained, but no trained encoder precedes it
+    firsts = [
+        encoder
+        for model in session.predictor.modules()
+        if isinstance(model, Model)
+        for encoder in list(model.encoders)[:1]
+    ]
     for module in session.predictor.modules():
         if (
             isinstance(module, FitsInputs)
             and module.needs_fit
-            and not any(module is encoder for encoder in front)
+            and not any(module is encoder for encoder in (*front, *firsts))
         ):
             raise ConfigError(
                 f"{type(module).__name__} is fitted to the inputs before training, but an encoder that is trained "
@@ -109,6 +116,9 @@ def _fit_encoders(session: Session) -> None:
     for number, encoder in enumerate(front):
         if isinstance(encoder, FitsInputs) and encoder.needs_fit:
             encoder.fit_inputs(_training_features(session, front[:number]))
+    for encoder in firsts:
+        if isinstance(encoder, FitsInputs) and encoder.needs_fit:
+            encoder.fit_inputs(_training_features(session, front))
 
 
 def _training_features(session: Session, encoders: Iterable[nn.Module]) -> Iterator[Tensor]:

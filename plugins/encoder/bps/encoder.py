@@ -61,7 +61,7 @@ class BPS(Encoder, FitsInputs):
     Raises:
         ConfigError: the input is not a cloud; a feature is named twice or needs a column that the clouds lack; the
             basis is "grid" and `points` is not the cube of an integer; the basis is "selected" and `points` is more
-            than 2048; or `learned` is true, and the basis is "grid" or "selected" or no feature is "distance" or
+            than 2048; or `learned` is true, and the basis is "grid" or no feature is "distance" or
             "delta".
     """
 
@@ -188,11 +188,6 @@ def _require_learnable(basis: str, features: Sequence[str]) -> None:
         raise ConfigError(
             "encoder bps: learned=true moves the basis points, but basis=grid is for convolutions over a regular grid. "
             "Choose another basis, such as ball_uniform, or set learned to false."
-        )
-    if basis == "selected":
-        raise ConfigError(
-            "encoder bps: basis=selected chooses the basis points before training, and learned=true trains them. Set "
-            "only one of them."
         )
     if not {"distance", "delta"} & set(features):
         raise ConfigError(

@@ -35,6 +35,9 @@ ROWS = {
             config={"points": 20, "features": ["distance", "delta", "normal"], "rotation_invariant": True},
         ),
         CloudRow("selected, before the fit", CLOUD, config={"basis": "selected", "points": 20}),
+        CloudRow(
+            "learned, before the fit", CLOUD, config={"basis": "selected", "points": 20, "learned": True}
+        ),
         CloudRow("learned", CLOUD, config={"points": 20, "learned": True, "features": ["distance", "delta"]}),
         CloudRow("one basis point, one point", (1, 3), config={"points": 1}),
     )

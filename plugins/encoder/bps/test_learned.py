@@ -78,10 +78,24 @@ def test_basis_points_move_to_the_points_of_a_cloud_if_the_distances_are_the_los
     torch.testing.assert_close(encoder(clouds), fixed(clouds), rtol=0, atol=1e-6)
 
 
+def test_a_learned_basis_starts_from_the_selected_points():
+    clouds = torch.randn(40, 30, 3, generator=torch.Generator().manual_seed(3))
+    learned, selected = (build_encoder(basis="selected", learned=part).double() for part in (True, False))
+    for encoder in (learned, selected):
+        assert encoder.needs_fit
+        encoder.fit_inputs([clouds.double()])
+    assert not torch.equal(selected.basis, build_encoder(basis="selected").double().basis)
+    assert torch.equal(learned.basis_points(), selected.basis_points())
+    torch.testing.assert_close(learned(clouds.double()), selected(clouds.double()), rtol=0, atol=1e-12)
+    optimizer = torch.optim.Adam(learned.parameters(), lr=1e-3)
+    learned(clouds.double()).square().mean().backward()
+    optimizer.step()
+    away = (learned.basis_points() - selected.basis).abs()
+    assert 0 < away.max() <= 0.0101  # ten times the learning rate
+
+
 def test_settings_that_cannot_be_learned_are_refused():
     with pytest.raises(ConfigError, match="basis=grid is for convolutions"):
         build_encoder(learned=True, basis="grid", points=8)
-    with pytest.raises(ConfigError, match="Set only one of them"):
-        build_encoder(learned=True, basis="selected")
     with pytest.raises(ConfigError, match=r"features=\['echo'\] are attributes"):
         build_encoder(learned=True, features=["echo"])
