@@ -3,7 +3,7 @@
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,6 +19,7 @@ from framework.modes import calibrate, train
 from framework.modes import test as testing
 from framework.runs import run as runs
 from framework.runs import session
+from framework.runs.resuming import blame_checkpoint
 from framework.runs.run import TRACEBACK, open_run
 from framework.tracking.run_info import read_run_info
 from framework.tracking.signals import Stopped
@@ -47,6 +48,39 @@ def composed() -> Iterator[Composed]:
     with initialize_config_dir(str(composition.folder()), version_base="1.3"):
         yield config
     GlobalHydra.instance().clear()
+
+
+def fail_in(module: str) -> None:
+    """Raise an error in a function of a module of this name, in torch."""
+    space: dict[str, Any] = {"__name__": module, "torch": torch}
+    exec(compile("def fail():\n    return torch.zeros(2) @ torch.zeros(3)\n", f"{module}.py", "exec"), space)
+    space["fail"]()
+
+
+@pytest.mark.parametrize(
+    ("module", "epochs", "kind", "message"),
+    [
+        (
+            "plugins.encoder.mine",
+            1,
+            CheckpointError,
+            r"a plugin failed at plugins\S*:2 \(RuntimeError: ",
+        ),
+        (
+            "pytorch_lightning.loops",
+            1,
+            CheckpointError,
+            r"^last\.ckpt: The training cannot continue from this",
+        ),
+        ("plugins.encoder.mine", 2, RuntimeError, "inconsistent tensor size"),
+    ],
+)
+def test_an_error_in_the_first_epoch_of_a_resumed_run_leads_to_its_cause(
+    module: str, epochs: int, kind: type[Exception], message: str
+) -> None:
+    training: Any = SimpleNamespace(begun_epochs=epochs)
+    with pytest.raises(kind, match=message), blame_checkpoint(Path("last.ckpt"), training):
+        fail_in(module)
 
 
 @pytest.mark.parametrize("error", [KeyError("x"), DataError("bad"), KeyboardInterrupt()], ids=repr)

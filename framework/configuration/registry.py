@@ -144,14 +144,20 @@ def load(group: str, name: str) -> type[Any]:
     return cls
 
 
-def _import_line(error: Exception) -> str:
-    """Return " (at <file>:<line>)", the line of a plugin that failed; "" for none, or if a syntax error names it."""
+def plugin_line(error: BaseException) -> str:
+    """Return file and line of the innermost line of a plugin through which an error passed; "" if there is none."""
     lines = [
-        f" (at {frame.f_code.co_filename}:{line})"
+        f"{frame.f_code.co_filename}:{line}"
         for frame, line in walk_tb(error.__traceback__)
         if frame.f_globals.get("__name__", "").partition(".")[0] in plugin_packages()
     ]
-    return lines[-1] if lines and not isinstance(error, SyntaxError) else ""
+    return lines[-1] if lines else ""
+
+
+def _import_line(error: Exception) -> str:
+    """Return " (at <file>:<line>)", the line of a plugin that failed; "" for none, or if a syntax error names it."""
+    place = plugin_line(error)
+    return f" (at {place})" if place and not isinstance(error, SyntaxError) else ""
 
 
 def _describe_missing_module(entry: Entry, module: str) -> str:

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from framework.configuration.config import Config
 from framework.configuration.paths import flatten, paths_of, require_repeated, shell_arguments
+from framework.configuration.registry import plugin_line
 from framework.configuration.settings import Settings
 from framework.errors import CheckpointError, ConfigError, UserError, shorten
 from framework.runs import provenance
@@ -178,9 +179,11 @@ def find_resumable(folder: Path) -> Path | None:
 
 @contextmanager
 def blame_checkpoint(checkpoint: Path | None, training: "Training") -> Iterator[None]:
-    """Convert errors in the first epoch of a resumed training to an error that names the checkpoint.
+    """Convert errors in the first epoch of a resumed training to an error that names the plugin or the checkpoint.
 
-    The state of optimisers, loops and callbacks may come from an untrusted source, and Lightning does not check it.
+    An error that passed through a plugin names the line of the plugin, since plugins may change between two runs. Any
+    other error names the checkpoint: the state of optimisers, loops and callbacks may come from an untrusted source,
+    and Lightning does not check it.
 
     Args:
         checkpoint: Checkpoint from which the training continues; None for a training that begins anew.
@@ -197,9 +200,15 @@ def blame_checkpoint(checkpoint: Path | None, training: "Training") -> Iterator[
         own = isinstance(error, UserError | OSError | MemoryError | torch.OutOfMemoryError)
         if checkpoint is None or training.begun_epochs > 1 or own:
             raise
+        fault = f"{type(error).__name__}: {shorten(error)}".removesuffix(": ")
+        if place := plugin_line(error):
+            raise CheckpointError(
+                f"The training cannot continue from {checkpoint}, because a plugin failed at {place} ({fault}). Mend "
+                "the plugin and resume again; traceback.txt in the run folder has all lines. If the plugin is right, "
+                "the checkpoint may be damaged: start a new run."
+            ) from error
         raise CheckpointError(
-            f"{checkpoint}: The training cannot continue from this checkpoint ({type(error).__name__}: "
-            f"{shorten(error)}). {DAMAGED}"
+            f"{checkpoint}: The training cannot continue from this checkpoint ({fault}). {DAMAGED}"
         ) from error
 
 
