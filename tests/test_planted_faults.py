@@ -1,20 +1,22 @@
 """Planted faults in density heads, which `mode=check` finds; the heads without a fault pass."""
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
-from torch.distributions import MultivariateNormal
+from torch.distributions import Distribution, Independent, MultivariateNormal, Uniform
 
 from framework.configuration.schema import build, resolve
 from framework.distributions.density import Mixture
 from framework.target import Target
 from framework.testing.adaptive import boxes
-from framework.testing.densities import integral_by_draws
+from framework.testing.densities import integral_by_draws, periodic
 from framework.testing.finding import Worst, require
 from framework.testing.head_subject import HeadSubject
 from framework.testing.heads import examine_head
 from framework.testing.precision import reference
+from framework.testing.protocol_checks import check_quadratic_bound
 from framework.testing.rows import HeadRow
 from plugins.density_head.latent.decoder import LatentDecoder
 from plugins.density_head.latent.rows import ROWS
@@ -71,6 +73,25 @@ def test_the_finding_of_a_density_that_is_0_for_some_targets_says_what_to_do() -
     (finding,) = examine_head(subject)
     assert not finding.holds
     assert "list targets for which it is not in HeadRow.values" in str(finding)
+
+
+class _UniformAngle(Independent):
+    """The uniform density of an angle."""
+
+    mode = torch.zeros(2, 1, dtype=torch.float64)
+
+    def log_prob(self, value: torch.Tensor) -> torch.Tensor:
+        return value.new_full(value.shape[:-1], -math.log(2 * math.pi))
+
+
+@pytest.mark.parametrize("check", [periodic, check_quadratic_bound])
+def test_a_density_whose_logarithm_has_no_gradient_passes(
+    check: Callable[[Distribution, Worst], None],
+) -> None:
+    edges = torch.full((2, 1), math.pi, dtype=torch.float64)
+    worst = Worst()
+    check(_UniformAngle(Uniform(-edges, edges), 1), worst)
+    assert worst.error <= 0
 
 
 @pytest.mark.parametrize("size", [3, 15])

@@ -383,7 +383,9 @@ def periodic(density: Distribution, worst: Worst) -> None:
     value[0], value[1], value[2] = math.pi, -math.pi, 0.0
     with torch.enable_grad():
         log_prob = density.log_prob(value.requires_grad_())
-        (slope,) = torch.autograd.grad(log_prob.sum(), value)
+        slope = torch.zeros_like(value)
+        if log_prob.requires_grad:  # that of a uniform density has no gradient
+            (slope,) = torch.autograd.grad(log_prob.sum(), value)
     for turns in (1, -1, 7, -1000):
         moved = value.detach() + turns * 2 * math.pi
         scale = log_prob.detach().abs().clamp(min=1) + slope.abs().sum(-1)

@@ -175,15 +175,15 @@ def compare_draws(density: Distribution, first: Tensor, second: Tensor, worst: W
 
 def check_quadratic_bound(density: Distribution, worst: Worst) -> None:
     """Check that `quadratic_bound` has the value and gradient of log_prob at a point and is a lower bound elsewhere."""
-    value = draws_and_mode(density).requires_grad_()
-    with torch.enable_grad():
-        log_prob = density.log_prob(value)
-        (gradient,) = torch.autograd.grad(log_prob.sum(), value)
-    value = value.detach()
+    value = draws_and_mode(density)
     bound_at_value = protocol.quadratic_bound(density, value)
     if bound_at_value is None:
         worst.count(False, "quadratic_bound is not known")
         return
+    with torch.enable_grad():
+        log_prob = density.log_prob(value.requires_grad_())
+        (gradient,) = torch.autograd.grad(log_prob.sum(), value)
+    value = value.detach()
     size = log_prob.detach().abs().clamp(min=1)
     worst.record(
         (bound_at_value.log_prob - log_prob).abs() / (1e-6 * size),
