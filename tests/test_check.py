@@ -10,6 +10,7 @@ from torch.distributions import MultivariateNormal
 
 from framework.distributions.protocol import marginal
 from framework.errors import ConfigError
+from framework.modes import check
 from framework.testing import contract as contracts
 from framework.testing.finding import Finding, Worst, require, run_check
 from plugins.density_head.gaussian.head import GaussianHead
@@ -209,3 +210,14 @@ def test_bits_that_differ_are_counted_and_nan_equals_nan() -> None:
     assert (worst.error, worst.case) == (0.5, "one off")
     worst.same_bits("shape", torch.zeros(2), torch.zeros(3))
     assert worst.error == math.inf
+
+
+def test_parameters_without_an_annotation_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Bare:
+        def __init__(self, *, width: int = 3, rate=0.5, free=None) -> None: ...
+
+    assert check.describe_untyped("metric", "accuracy") == ""
+    monkeypatch.setattr(check, "load", lambda group, name: Bare)
+    assert "metric mine: the parameters rate, free have no annotation" in check.describe_untyped(
+        "metric", "mine"
+    )

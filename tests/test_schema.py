@@ -24,6 +24,7 @@ from framework.configuration.registry import GROUPS, installed
 from framework.configuration.registry import load as load_installed
 from framework.configuration.schema import build, forbid_targets, resolve
 from framework.configuration.settings import device_of
+from framework.configuration.signature import untyped
 from framework.encoder import Encoder
 from framework.errors import ConfigError
 from framework.storage import checkpoints
@@ -403,6 +404,21 @@ def test_a_key_may_have_any_name(key: str, toys: dict[str, type], recwarn: pytes
     with pytest.raises(ConfigError, match=rf"encoder\.{key} = 'a': .*number"):
         resolve("encoder", {"name": "odd", key: "a"})
     assert not recwarn.list
+
+
+def test_a_parameter_without_an_annotation_is_compared_with_its_default(toys: dict[str, type]) -> None:
+    class Bare(Toy):
+        def __init__(self, input_shape, *, rate=0.5, steps=3, quick=False, word="a", free=None):
+            Encoder.__init__(self)
+            self.input_shape, self.output_shape = input_shape, (1,)
+
+    toys["bare"] = Bare
+    assert untyped(Bare) == ["rate", "steps", "quick", "word", "free"] and untyped(Toy) == []
+    good = {"rate": 1, "steps": 0.5, "quick": True, "word": "b", "free": [1]}
+    assert resolve("encoder", {"name": "bare", **good}) == {"name": "bare", **good}
+    for key, value in {"rate": "0,1", "steps": [3], "quick": "maybe", "word": 3}.items():
+        with pytest.raises(ConfigError, match=rf"encoder\.{key} = "):
+            resolve("encoder", {"name": "bare", key: value})
 
 
 def test_a_part_may_be_annotated_in_many_ways(toys: dict[str, type]) -> None:

@@ -7,7 +7,9 @@ import typing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import AfterValidator
 
 from framework.configuration.registry import group_of
 from framework.errors import ConfigError, shorten
@@ -112,6 +114,8 @@ def _is_value(kind: Any) -> bool:
 def _keywords(cls: type) -> dict[str, tuple[Any, Any]]:
     """Return annotation and default of every keyword-only parameter.
 
+    A parameter without an annotation has the type of its default, if this is a number, a truth value or a text.
+
     Raises:
         ConfigError: An annotation cannot be evaluated.
     """
@@ -121,10 +125,37 @@ def _keywords(cls: type) -> dict[str, tuple[Any, Any]]:
         if field.default_factory is not MISSING
     }
     return {
-        name: (_annotation(cls, name), factories[name]() if name in factories else parameter.default)
+        name: (
+            _type_of(parameter.default) if name in untyped(cls) else _annotation(cls, name),
+            factories[name]() if name in factories else parameter.default,
+        )
         for name, parameter in inspect.signature(cls.__init__).parameters.items()
         if parameter.kind is parameter.KEYWORD_ONLY
     }
+
+
+def untyped(cls: type) -> list[str]:
+    """Return the names of the keyword-only parameters without an annotation."""
+    annotated = getattr(cls.__init__, "__annotations__", {})
+    return [
+        name
+        for name, parameter in inspect.signature(cls.__init__).parameters.items()
+        if parameter.kind is parameter.KEYWORD_ONLY and name not in annotated
+    ]
+
+
+def _type_of(default: Any) -> Any:
+    """Return the type that a default shows: any number for a number, and any value for other defaults than texts."""
+    if isinstance(default, bool | str):
+        return type(default)
+    return Annotated[Any, AfterValidator(_require_number)] if isinstance(default, int | float) else Any
+
+
+def _require_number(value: Any) -> Any:
+    """Return the value if it is a number, of the same type; pydantic turns the error into a message with the key."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError("expected a number, as the default is. Write a number, or annotate the parameter")
+    return value
 
 
 def _annotation(cls: type, name: str) -> Any:

@@ -13,7 +13,9 @@ from rich.table import Table
 from rich.text import Text
 
 from framework.configuration.config import Config, Options
+from framework.configuration.registry import load
 from framework.configuration.settings import Settings
+from framework.configuration.signature import untyped
 from framework.errors import ConfigError, UserError
 from framework.reports.table import write_csv
 from framework.storage.progress import PlainConsole
@@ -70,6 +72,8 @@ def run(config: Config) -> None:
                 "Mend this line."
             ) from error
         console.print(report)
+        if note := describe_untyped(group, part["name"]):
+            console.print(note, soft_wrap=True)
         lines += findings
         failed += broken
     config.folder.mkdir(parents=True, exist_ok=True)
@@ -88,6 +92,18 @@ def _listed(names: Iterable[str], most: int = 6) -> str:
     first = list(names)
     more = f" and {len(first) - most} more" if len(first) > most else ""
     return ", ".join(first[:most]) + more
+
+
+def describe_untyped(group: str, name: str) -> str:
+    """Return a note about the parameters of a plugin's constructor that have no annotation; "" if all have one."""
+    names = untyped(load(group, name))
+    if not names:
+        return ""
+    return (
+        f"note: {group} {name}: the parameters {', '.join(names)} have no annotation, so that a value is compared at "
+        "most with the type of the default. Annotate them with their types and ranges, which are checked before any "
+        "data are read."
+    )
 
 
 def examine(plugin: Contract, console: Console) -> tuple[Group, list[dict[str, object]], list[str]]:
