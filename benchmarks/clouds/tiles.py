@@ -252,9 +252,9 @@ def conclusion(rows: Sequence[Mapping[str, Any]], left_out: Mapping[str, Tensor]
     ]
     fastest = min(near, key=lambda row: row["milliseconds"])
     if fastest is best:
-        return f"The highest mean IoU has *{best['input']}*; no faster input is within two standard errors of it."
+        return f"*{best['input']}* has the highest mean IoU; no faster input is within two standard errors of it."
     return (
-        f"The highest mean IoU has *{best['input']}*. *{fastest['input']}* is the fastest of the inputs within two "
+        f"*{best['input']}* has the highest mean IoU. *{fastest['input']}* is the fastest of the inputs within two "
         "standard errors of it on the same tiles."
     )
 
