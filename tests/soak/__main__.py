@@ -363,6 +363,12 @@ def page(soak: Soak, kinds: list[Soaked]) -> str:
     missing += [name for name in EVENTS if name not in counts.events]
     tallies = [tally for by_signal in counts.tallies.values() for tally in by_signal.values()]
     tests = [test for test in (*soak.earlier, soak.state) if test.total]
+    coverage = (
+        "The test has not yet killed the following commands and processes (each item names a command and, after a "
+        f"comma, the process that is killed): {'; '.join(missing)}."
+        if missing
+        else "Each kind of command and process in the test has been killed."
+    )
     return "\n".join(
         [
             "# Soak test",
@@ -373,8 +379,7 @@ def page(soak: Soak, kinds: list[Soaked]) -> str:
             f"tests.soak {soak.count} --folder <folder>`, which is repeated until all kills are made. It adds its "
             "kills to those of earlier tests, which `soak.json` holds. The end of the page lists the tests.",
             "",
-            "The test has not yet killed the following commands and processes (each item names a command and, "
-            f"after a comma, the process that is killed): {'; '.join(missing) or 'none'}.",
+            coverage,
             "",
             f"- *all ended*: no process of the command was alive {ALLOWED:.0f} s after the kill; the longest time is "
             "in brackets. If a job, a fork server or a worker is killed, the command goes on and starts the job "
