@@ -11,6 +11,7 @@ from framework.distributions.density import Mixture
 from framework.distributions.tempering import temper
 from framework.errors import ConfigError
 from framework.model import Model
+from framework.storage.weights import describe_mismatch
 from framework.target import Target
 from framework.testing.plain import Plain
 from framework.uncertainty import held_out
@@ -265,6 +266,21 @@ def test_a_loaded_mixture_is_as_narrow_as_the_stored_one():
     wide = folds(steps=200)
     wide.train_models(inputs, target, seed=0, batch_size=32)
     assert wide.model_share == 0 and not torch.equal(wide(inputs).log_prob(target), log_prob)
+
+
+def test_a_state_without_the_share_of_the_models_loads_and_predicts_as_before():
+    """States of versions before `sharpen` have no such number, and their configs do not have the setting."""
+    inputs, target = table(300)
+    wrapper = folds(steps=200)
+    wrapper.train_models(inputs, target, seed=0, batch_size=32)
+    groups = wrapper.models.densities(inputs)
+    each = torch.stack([part.log_prob(target.unsqueeze(1)).logsumexp(1) - math.log(3) for part in groups], 1)
+    before = torch.logsumexp(each + wrapper.log_weights, 1)
+    state = {name: value for name, value in wrapper.state_dict().items() if name != "model_share"}
+    loaded = folds().eval()
+    loaded.load_state_dict(state)
+    assert describe_mismatch(loaded.state_dict(), state) is None
+    torch.testing.assert_close(loaded(inputs).log_prob(target), before)
 
 
 def test_samples_that_are_nearly_impossible_are_reported():

@@ -76,7 +76,8 @@ class Folds(Uncertainty, SelfTraining):
 
     Attributes:
         log_weights: logarithms of the weights of the groups, a float64 buffer.
-        model_share: share ρ of the models in the variance of the residuals, a float64 buffer.
+        model_share: share ρ of the models in the variance of the residuals, a float64 buffer; a part of the state only
+            if `sharpen` is set, so that states without it, as of earlier versions, load.
 
     Raises:
         ConfigError: `dropout` and `weight_decay` have different lengths, the model has no part to train, or `sharpen`
@@ -124,7 +125,7 @@ class Folds(Uncertainty, SelfTraining):
             )
         equal = torch.full((len(dropout),), -math.log(len(dropout)), dtype=torch.float64)
         self.register_buffer("log_weights", equal)
-        self.register_buffer("model_share", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("model_share", torch.zeros((), dtype=torch.float64), persistent=sharpen)
         require_state(self, log_weights=(-100.0, 1e-9), model_share=(0.0, LARGEST_SHARE))
         self.sharpen = sharpen
         self._sharpened = False
