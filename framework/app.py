@@ -4,7 +4,6 @@ import logging
 import os
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from importlib.util import find_spec
 from io import TextIOWrapper
 from pathlib import Path
@@ -107,6 +106,7 @@ def _run() -> None:
         return
     from framework.configuration.command_line import command_line
     from framework.configuration.composition import folder, help_text, plain, register
+    from framework.storage.files import remove_empty_folders
 
     if {"--help", "-h"} & set(sys.argv[1:]):
         sys.stdout.write(help_text() + "\n")
@@ -129,10 +129,7 @@ def _run() -> None:
         try:
             return modes.run(plain(config), run_folder, list(hydra_config.overrides.task))
         except UserError as error:
-            with suppress(
-                OSError
-            ):  # a folder that holds files stays; the empty one of a run that never began is removed
-                run_folder.rmdir()
+            remove_empty_folders(run_folder)
             # Hydra would print a long stack trace of its own around the sentence.
             failures.append(error)
             return None

@@ -264,7 +264,7 @@ def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
         if page:
             assert page.startswith("help:  docs/") and page.endswith(".md\n"), page
             assert (ROOT / page.removeprefix("help:  ").strip()).is_file(), page
-        assert not [*(tmp_path / "here").rglob("*.*")], "a mistake is not a run"
+        assert not [*(tmp_path / "here").iterdir()], "a mistake is not a run"
         return said
 
     return say

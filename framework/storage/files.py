@@ -8,7 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from traceback import walk_tb
 
@@ -27,6 +27,20 @@ _CLOSED = (
     errno.EISDIR,
     errno.ENAMETOOLONG,
 )
+
+
+def remove_empty_folders(folder: Path) -> None:
+    """Remove the folder of a command that wrote nothing, and folders above it in `outputs` that hold nothing else.
+
+    Folders that hold files stay.
+    """
+    outputs = Path("outputs").absolute()
+    with suppress(OSError):
+        folder.rmdir()
+        for parent in folder.absolute().parents:
+            if not parent.is_relative_to(outputs):
+                break
+            parent.rmdir()
 
 
 def is_disk_full(error: OSError) -> bool:

@@ -7,7 +7,7 @@ import logging
 import sys
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from framework.configuration.composition import in_quotes
 from framework.errors import ConfigError
 from framework.storage.enclosed import require_enclosed
-from framework.storage.files import hold_lock
+from framework.storage.files import hold_lock, remove_empty_folders
 from framework.sweeps import jobs as sweep
 from framework.sweeps.engines import Engine, Pool, cores
 from framework.sweeps.sending import JournalSender
@@ -370,8 +370,7 @@ def _remove_empty_sweep(folder: Path) -> None:
     if {file.name for file in files} <= {"multirun.yaml", _LOCK}:
         for file in files:
             file.unlink()
-        with suppress(OSError):  # another sweep may begin in the folder
-            folder.rmdir()
+        remove_empty_folders(folder)  # it stays if another sweep has begun in it
 
 
 def _job_return(job: sweep.Job, failure: Exception | None) -> JobReturn:
