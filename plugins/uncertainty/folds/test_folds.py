@@ -1,4 +1,6 @@
 import math
+from contextlib import suppress
+from functools import partial
 
 import pytest
 import torch
@@ -6,6 +8,7 @@ from torch import nn
 from torch.distributions import Independent, Normal
 
 from framework.calibration.validation import predict_densities
+from framework.configuration.registry import installed
 from framework.configuration.schema import build, resolve
 from framework.distributions.density import Mixture
 from framework.distributions.tempering import temper
@@ -24,13 +27,15 @@ TARGET = Target("real", ("y",), location=(3.0,), scale=(2.0,))
 SHORT = {"folds": 3, "steps": 40, "epochs": 1}
 
 
-def model(target=TARGET, head="student_t", width=16):
+def model(target=TARGET, name="student_t", width=16, **settings):
     encoder = build(
         "encoder",
         resolve("encoder", {"name": "mlp", "widths": [width], "activation": "silu"}),
         input_shape=(2,),
     )
-    return Model([encoder], build("density_head", resolve("density_head", {"name": head}), target=target))
+    return Model(
+        [encoder], build("density_head", resolve("density_head", {"name": name, **settings}), target=target)
+    )
 
 
 def folds(build_model=model, **config):
@@ -145,7 +150,7 @@ def test_networks_that_compute_something_else_are_not_stacked():
 @pytest.mark.parametrize("head", ["student_t", "gaussian"])
 def test_other_models_train_too(head):
     inputs, target = torch.randn(60, 6), torch.randn(60, 1)
-    wrapper = folds(lambda: Plain(TARGET)) if head == "gaussian" else folds(lambda: model(head=head))
+    wrapper = folds(lambda: Plain(TARGET)) if head == "gaussian" else folds(lambda: model(name=head))
     inputs = inputs if head == "gaussian" else inputs[:, :2]
     before = [parameter.clone() for parameter in wrapper.parameters()]
     assert math.isfinite(wrapper.train_models(inputs, target, seed=0, batch_size=16))
@@ -268,6 +273,34 @@ def test_a_loaded_mixture_is_as_narrow_as_the_stored_one():
     assert wide.model_share == 0 and not torch.equal(wide(inputs).log_prob(target), log_prob)
 
 
+def test_every_head_of_a_number_is_narrowed_or_says_why_not():
+    inputs, target = table(60)
+    remarks = {}
+    with_components = [{"name": name, "component": {"name": "gaussian"}} for name in ("mixture", "cvae")]
+    for head in [*({"name": name} for name in installed("density_head")), *with_components]:
+        with suppress(ConfigError):  # heads of other targets
+            wrapper = folds(partial(model, **head), steps=5, sharpen=True)
+            wrapper.train_models(inputs, target, seed=0, batch_size=32)
+            remarks[head["name"]] = wrapper.remark
+            assert wrapper.eval()(inputs).log_prob(target).isfinite().all()
+    assert remarks.keys() >= {"gaussian", "student_t", "evidential", "quantiles", "mixture", "cvae"}
+    for name, remark in remarks.items():
+        said = "the powers of its densities are not known" if name == "quantiles" else "has the temperature"
+        assert said in remark, name
+
+
+def test_mixtures_that_are_not_narrowed_say_why():
+    inputs, target = table()
+    wrapper = folds(dropout=[0.1], weight_decay=[0.1], sharpen=True)
+    wrapper.train_models(inputs, target, seed=0, batch_size=32)
+    assert "has one group of models, and two are needed" in wrapper.remark
+    both = Target("class", ("a", "b"))
+    resolved = resolve("uncertainty", {"name": "folds", **SHORT, "sharpen": True})
+    classes = build("uncertainty", resolved, model=lambda: model(both, "categorical"), target=both)
+    classes.train_models(inputs, (target[:, 0] > 3).long(), seed=0, batch_size=32)
+    assert "its target is of kind class, not real" in classes.remark and classes.model_share == 0
+
+
 def test_a_state_without_the_share_of_the_models_loads_and_predicts_as_before():
     """States of versions before `sharpen` have no such number, and their configs do not have the setting."""
     inputs, target = table(300)
@@ -286,7 +319,7 @@ def test_a_state_without_the_share_of_the_models_loads_and_predicts_as_before():
 def test_samples_that_are_nearly_impossible_are_reported():
     inputs, target = table()
     target[11] += 1e9
-    wrapper = folds(lambda: model(head="gaussian"))
+    wrapper = folds(lambda: model(name="gaussian"))
     wrapper.train_models(inputs, target, seed=0, batch_size=16)
     assert (
         "1 of these samples are more than 20 nats less likely" in wrapper.remark
@@ -297,8 +330,6 @@ def test_samples_that_are_nearly_impossible_are_reported():
 def test_wrong_settings_are_refused():
     with pytest.raises(ConfigError, match="each needs one number for each group"):
         folds(dropout=[0.1])
-    with pytest.raises(ConfigError, match="and the number of groups is 1"):
-        folds(dropout=[0.1], weight_decay=[0.1], sharpen=True)
     with pytest.raises(ConfigError, match="needs at least 6 samples"):
         folds().train_models(*table(5), seed=0, batch_size=16)
 

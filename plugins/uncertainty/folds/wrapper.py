@@ -62,7 +62,7 @@ class Folds(Uncertainty, SelfTraining):
     and two groups or more, `sharpen` raises the density of each model to the power 1/T, as their spread-adjusted
     linear pool does for normal densities. `pool_temperature` derives T from the weights of the models
     and the share of the models in the variance of the residuals; `fit_model_share` obtains this share from the left-out
-    samples.
+    samples. Other mixtures are not narrowed, and a remark says why.
 
     Args:
         target: the predicted quantity.
@@ -72,7 +72,7 @@ class Folds(Uncertainty, SelfTraining):
         learning_rate: largest learning rate.
         steps, epochs: smallest number of steps, and smallest number of passes over its samples, for which each group
             trains.
-        sharpen: whether mixtures of several models are narrowed; for real targets and at least two groups.
+        sharpen: whether mixtures of several models are narrowed, for real targets and at least two groups.
 
     Attributes:
         log_weights: logarithms of the weights of the groups, a float64 buffer.
@@ -80,8 +80,7 @@ class Folds(Uncertainty, SelfTraining):
             if `sharpen` is set, so that states without it, as of earlier versions, load.
 
     Raises:
-        ConfigError: `dropout` and `weight_decay` have different lengths, the model has no part to train, or `sharpen`
-            is set for a target that is not real or for one group.
+        ConfigError: `dropout` and `weight_decay` have different lengths, or the model has no part to train.
     """
 
     bibtex = "stone1974cross, wolpert1992stacked, seitzer2022pitfalls, gneiting2013combining, krogh1995neural"
@@ -117,17 +116,12 @@ class Folds(Uncertainty, SelfTraining):
             raise ConfigError(
                 "uncertainty folds trains models by gradient, but this model has nothing to train."
             )
-        if sharpen and (target.kind != "real" or len(dropout) == 1):
-            raise ConfigError(
-                "uncertainty.folds.sharpen = true needs a target of real numbers and at least two groups of models "
-                f"(entries of uncertainty.folds.dropout), but the target is of kind {target.kind!r}, and the number of "
-                f"groups is {len(dropout)}. Set it to false."
-            )
         equal = torch.full((len(dropout),), -math.log(len(dropout)), dtype=torch.float64)
         self.register_buffer("log_weights", equal)
         self.register_buffer("model_share", torch.zeros((), dtype=torch.float64), persistent=sharpen)
         require_state(self, log_weights=(-100.0, 1e-9), model_share=(0.0, LARGEST_SHARE))
         self.sharpen = sharpen
+        self._kind = target.kind
         self._sharpened = False
         self.register_load_state_dict_post_hook(lambda module, _: module._note_share())
         self._fold: Tensor | None = None
@@ -254,23 +248,32 @@ class Folds(Uncertainty, SelfTraining):
                 groups.append(self._groups(batch["input"]))
             log_prob = torch.cat([log_prob_of_groups(*pair) for pair in zip(groups, batches, strict=True)])
             self.log_weights.copy_(fit_log_weights(log_prob))
-            note = ""
-            if self.sharpen:
-                try:
-                    self.model_share.fill_(fit_model_share(groups, batches))
-                except UserError:
-                    note = " The mixture is not narrowed, because the powers of its densities are not known."
+            note = self._fit_share(groups, batches) if self.sharpen else ""
             self._note_share()
             for several, batch in zip(groups, batches, strict=True):
                 parts.append(self._pool(several).log_prob(batch["target"]).double())
         finally:
             self.rows = None
         pooled = torch.cat(parts)
-        if self._sharpened:
+        if self.sharpen and not note:
             temperature = pool_temperature(self.model_share, self.log_weights, self.folds).item()
             note = f" The mixture of all models has the temperature {temperature:.2f}."
         self.remark = describe(pooled, self.log_weights) + note
         return -pooled.mean().item()
+
+    def _fit_share(self, groups: Sequence[Sequence[Distribution]], batches: Sequence[Batch]) -> str:
+        """Fit `model_share` to left-out samples, and return a note if the mixture cannot be narrowed."""
+        obstacle = ""
+        if self._kind != "real":
+            obstacle = f"its target is of kind {self._kind}, not real"
+        elif len(self.log_weights) == 1:
+            obstacle = "uncertainty.folds.dropout has one group of models, and two are needed"
+        else:
+            try:
+                self.model_share.fill_(fit_model_share(groups, batches))
+            except UserError:
+                obstacle = "the powers of its densities are not known"
+        return obstacle and f" The mixture is not narrowed (uncertainty.folds.sharpen), because {obstacle}."
 
     @torch.no_grad()
     def calibrate(self, batches: Iterable[Batch]) -> None:
