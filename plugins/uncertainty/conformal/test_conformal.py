@@ -356,5 +356,5 @@ def test_quantiles_of_other_targets_are_refused_and_a_narrowed_interval_may_be_e
     assert not narrowed.contains(torch.zeros(2, 1)).any()
     whole = PredictionSet(normal, torch.tensor(math.inf), "quantiles", 0.9)
     assert whole.intervals() == [[(-math.inf, math.inf)]] * 2 and whole.contains(torch.zeros(2, 1)).all()
-    with pytest.raises(ConfigError, match="needs the stated probability"):
+    with pytest.raises(ConfigError, match="needs the probability of the central interval"):
         PredictionSet(normal, torch.tensor(0.0), "quantiles")
