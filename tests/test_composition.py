@@ -140,6 +140,7 @@ REFUSED = {
     "coil20": "data.root is not set",
     "dales": "data.root is not set",
     "images": "data.root is not set",
+    "labelled_points": "data.root is not set",
     "moons/distillation": "objective.distillation.teacher is null",
     "tabular": "data.path is not set",
     "uci": "data.root is not set",
