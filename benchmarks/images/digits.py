@@ -360,8 +360,8 @@ def reading_errors(masses: Mapping[str, Sequence[np.ndarray]]) -> str:
             f"{wrong.mean():.3f} ± {chance:.3f}."
         )
     count = len(next(iter(masses.values()))[0])
-    return f"""In this list, ± is the standard error over the {count} test images. If a density is calibrated, the mean mass
-of the less likely reading equals the share of images where this reading is the true one:
+    return f"""In this list, ± is the standard error over the {count} test images. If a density is calibrated, the
+mean mass of the less likely reading equals the share of images where this reading is the true one:
 
 {chr(10).join(clauses)}"""
 
