@@ -376,7 +376,7 @@ def page(root: Path) -> None:
         "time of a prediction is the "
         "processor time of a row in a batch of 2000 rows by the frozen model on one thread, a median over "
         f"{TIMED} splits; the last column also includes the point prediction, which is the median of "
-        "the density. These times too are upper bounds, because other programs kept both cores busy. Measured in turns "
+        "the density. Measured in turns "
         "on one model of yacht, a density took 0.0109 ms, and 0.0108 ms without narrowing. A run trains at least 3000 "
         f"steps and {epochs_of(rows)} epochs.",
         "",
