@@ -1,8 +1,8 @@
-"""Compare the run time of a training step of the framework with that of plain PyTorch loops.
+"""Compare the run time of a training step of the framework with that of Lightning alone and of plain PyTorch loops.
 
     python -m benchmarks.framework.step_overhead
 
-The framework's steps are those of its command, and their times are read from the journal of the run. The plain loops
+The framework's steps are those of its command, and their times are read from the journal of the run. The other loops
 use the same numbers of samples, the same batch size, fused optimiser and gradient clipping. The script writes
 step_overhead.md beside this file.
 """
@@ -13,12 +13,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from pytorch_lightning import LightningModule, Trainer
 from torch import Tensor, nn
 
 from benchmarks.commands import ROOT
@@ -147,6 +148,40 @@ CASES = (
 )  # fmt: skip
 
 
+class Batches:
+    """Batches of the training data, in a new random order in each epoch."""
+
+    def __init__(self, inputs: Tensor, target: Tensor, size: int) -> None:
+        self.inputs, self.target, self.size = inputs, target, size
+
+    def __len__(self) -> int:
+        return -(-len(self.inputs) // self.size)
+
+    def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
+        for rows in torch.randperm(len(self.inputs)).split(self.size):
+            yield self.inputs[rows], self.target[rows]
+
+
+class PlainModule(LightningModule):
+    """A model in plain PyTorch for Lightning's trainer, which does nothing at a step but train it."""
+
+    def __init__(self, case: Case) -> None:
+        super().__init__()
+        self.model, self.optimizer = case.plain(), case.optimizer
+
+    def training_step(self, batch: tuple[Tensor, Tensor]) -> Tensor:
+        return self.model(*batch)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return OPTIMIZERS[self.optimizer](self.parameters(), lr=1e-3, fused=True)
+
+    def on_train_start(self) -> None:
+        self.start = time.perf_counter()
+
+    def on_train_end(self) -> None:
+        self.seconds = time.perf_counter() - self.start
+
+
 def time_plain_loop(
     parameters: Sequence[nn.Parameter], loss: Callable[[Tensor, Tensor], Tensor], case: Case
 ) -> float:
@@ -157,14 +192,14 @@ def time_plain_loop(
         loss: Function that returns the loss of a batch, a scalar.
         case: Training data and settings.
     """
-    inputs, target = case.samples()
+    batches = Batches(*case.samples(), case.batch)
     optimizer = OPTIMIZERS[case.optimizer](parameters, lr=1e-3, fused=True)
     steps = 0
     start = time.perf_counter()
     for _ in range(case.epochs):
-        for rows in torch.randperm(len(inputs)).split(case.batch):
+        for inputs, target in batches:
             optimizer.zero_grad()
-            loss(inputs[rows], target[rows]).backward()
+            loss(inputs, target).backward()
             if case.clip is not None:
                 nn.utils.clip_grad_norm_(parameters, case.clip)
             optimizer.step()
@@ -185,6 +220,17 @@ def time_predictor(case: Case) -> float:
     return time_plain_loop(
         list(model.train().parameters()), lambda inputs, target: model.loss(inputs, target).mean(), case
     )
+
+
+def time_lightning(case: Case) -> float:
+    """Return the milliseconds a step of Lightning's trainer, without callbacks and loggers, on the plain model."""
+    module = PlainModule(case)
+    trainer = Trainer(
+        accelerator="cpu", max_epochs=case.epochs, gradient_clip_val=case.clip, logger=False,
+        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
+    )  # fmt: skip
+    trainer.fit(module, Batches(*case.samples(), case.batch))
+    return 1e3 * module.seconds / trainer.global_step
 
 
 def time_framework(case: Case) -> float:
@@ -216,6 +262,7 @@ def main() -> None:
     loops = {
         "plain loop, plain model": time_plain_model,
         "plain loop, framework's model": time_predictor,
+        "Lightning alone, plain model": time_lightning,
         "framework's command": time_framework,
     }
     rows = []
@@ -225,15 +272,16 @@ def main() -> None:
             name: Rounds(tuple(column))
             for name, column in zip(loops, zip(*rounds_of_loops, strict=True), strict=True)
         }
-        *plain, framework = times.values()
-        ratios = [framework_ratio.times_faster(framework, 3) for framework_ratio in plain]
+        *others, framework = times.values()
+        ratios = [other.times_faster(framework, 3) for other in others]
         rows.append(f"| {' | '.join([case.name, *(rounds.text() for rounds in times.values()), *ratios])} |")
     text = "\n".join(
         [
-            "# Training step: run time of the framework and of plain PyTorch loops",
+            "# Training step: run time of the framework, of Lightning and of plain PyTorch loops",
             "",
             "This page compares the time of a training step of this framework with the time of a step in a plain "
-            "PyTorch loop. The difference is what the framework itself costs.",
+            "PyTorch loop, and in Lightning's trainer, on which the framework is built. The difference is what the "
+            "framework and Lightning cost.",
             "",
             "The column `framework's command` is the training of `python -m framework` with the settings in the first "
             f"column and `{' '.join(QUIET)}`. Its times are read from the journal of the run: the time between the "
@@ -241,16 +289,17 @@ def main() -> None:
             "framework does at a step and between two epochs, such as reading batches, callbacks, schedules and the "
             "journal. `plain loop, plain model` is a PyTorch loop with a network and a loss that are written in plain "
             "PyTorch. `plain loop, framework's model` is the same loop with the same network as a model of this "
-            "framework. The plain loops use the same number of samples, batch size, fused optimiser and clipping of "
-            "gradients.",
+            "framework. `Lightning alone, plain model` is Lightning's trainer without callbacks, loggers and "
+            "validation, whose module returns the loss of the model in plain PyTorch. These loops "
+            "use the same number of samples, batch size, fused optimiser and clipping of gradients as the command.",
             "",
             f"Each time of a training step is the median of {ROUNDS} rounds (least to largest) of wall time on one "
-            "thread. The framework and the plain loops run in turn. The last two columns hold the framework's time "
-            "divided by the time of a plain loop. A ratio of 1 means that the framework costs no time.",
+            "thread. The framework and the other loops run in turn. The last three columns hold the framework's time "
+            "divided by the time of another loop. A ratio of 1 means that the framework costs no time.",
             "",
             f"| training | {', ms a step | '.join(loops)}, ms a step | ratio to plain loop, plain model | ratio to "
-            "plain loop, framework's model |",
-            "|---|---:|---:|---:|---:|---:|",
+            "plain loop, framework's model | ratio to Lightning alone |",
+            "|---|---:|---:|---:|---:|---:|---:|---:|",
             *rows,
             "",
             f"{machine('torch', 'pytorch-lightning')} Command: `python -m benchmarks.framework.step_overhead`.",
