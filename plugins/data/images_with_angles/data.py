@@ -120,7 +120,7 @@ class ImagesWithAngles(Data):
         self._own = Trained(content)
         chosen = np.array([row.split for row in table.rows])
         stated = chosen if table.states_splits else np.full(len(chosen), "")
-        if are_all_for_test(stated, self.test or 0, self._trained, content, root):
+        if are_all_for_test(stated, float(self.test or 0), self._trained, content, root):
             return table._replace(rows=[row._replace(split="test") for row in table.rows])
         self.remarks += describe_tested_share(stated, chosen, self._trained, content, root)
         return table
