@@ -286,6 +286,20 @@ INTERVAL_CASES = [
     if name == "gaussian" or wrapper in (None, "conformal", "temperature")
 ]
 """Pairs of a density head and a wrapper: all wrappers for one head, and for every head those that calibrate it."""
+REFUSED_PAIRS = {
+    **dict.fromkeys(
+        (("hybrid", wrapper) for wrapper in (None, "conformal", "temperature")), "HybridHead reads 10 numbers"
+    ),
+    **dict.fromkeys(
+        (("lstm", wrapper) for wrapper in (None, "conformal", "temperature")), "LSTMHead reads 20 numbers"
+    ),
+    ("evidential", "temperature"): "it has a variance only at temperatures below",
+    ("gaussian", "feature_score"): "A ScoredDensity cannot be exported",
+    ("gaussian", "mc_dropout"): "needs a dropout layer",
+    ("gaussian", "platt"): "describes targets of kind 'class'",
+    ("gaussian", "refined"): "spectra of 93 offsets",
+}
+"""Pairs that the small model of the test does not fit, or that are not exported, with words of the refusal."""
 
 
 @pytest.mark.parametrize(("name", "wrapper"), INTERVAL_CASES)
@@ -308,7 +322,9 @@ def test_an_exported_model_and_mode_predict_print_the_same_intervals(name: str, 
             density = predictor.eval()(batch["input"][:5])
             own, estimated = as_numpy(density), any(exported(density).remarks())
     except UserError as error:
-        pytest.skip(f"cannot be built or exported: {error}")
+        assert REFUSED_PAIRS.get((name, wrapper), "an export") in str(error)
+        return
+    assert (name, wrapper) not in REFUSED_PAIRS
 
     def predicted(mass: float | None) -> Mapping[str, Any]:
         if mass:

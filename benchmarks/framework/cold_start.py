@@ -129,7 +129,7 @@ def measure_parts() -> dict[str, float]:
 def page(rows: Sequence[dict[str, Any]]) -> str:
     """Return the text of the page."""
     lines = []
-    own = median([row["empty_own"] - row["filled_own"] for row in rows])
+    wall = median([row["empty_wall"] - row["filled_wall"] for row in rows])
     for key, name in KINDS.items():
         empty, filled = ([row[f"{state}_{key}"] for row in rows] for state in STATES)
         difference = [more - less for more, less in zip(empty, filled, strict=True)]
@@ -163,9 +163,8 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
             f"evaluation of the von Mises density takes {compiled['von_mises']} s, also because it compiles.",
             "",
             f"Before the rounds, other processes used {median_and_range([row['others'] for row in rows], 2)} of 2 "
-            "cores. Such work multiplies wall times, and lengthens processor times less. The limit of "
-            f"{LIMIT} s is for a machine without other work. With such work, the additional processor time of the main "
-            f"process is {'above' if own > LIMIT else 'below'} {LIMIT} s.",
+            "cores. Such work multiplies wall times, and lengthens processor times less. The additional wall time is "
+            f"{'above' if wall > LIMIT else 'at most'} {LIMIT} s.",
             "",
             f"{machine('numba', 'torch', 'pytorch-lightning')} Command: `python -m benchmarks.framework.cold_start`.",
             "",

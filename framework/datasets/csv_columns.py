@@ -261,9 +261,8 @@ def csv_rows(file: Path, missing: str, writing: Writing | None = None) -> Iterat
 
 def _rows(lines: io.TextIOWrapper, writing: Writing) -> Any:
     start = list(itertools.islice(lines, FIRST_LINES))
-    stated = (
-        re.fullmatch(r"sep=(.)\s*", start[0]) if start else None
-    )  # Excel states the separator in such a line
+    # Excel states the separator in a line of its own
+    stated = re.fullmatch(r"sep=(.)\s*", start[0]) if start else None
     sign = stated[1] if stated else writing.delimiter or _separator(start)
     rest = itertools.chain(start, lines)
     if sign == " ":

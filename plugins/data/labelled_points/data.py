@@ -369,8 +369,12 @@ def _fit_scaling(
     All basis points of the whole scan have one common scaling, because there are few scans. A feature that is constant
     is not divided.
     """
-    points = np.concatenate([scan.points for scan in scans])
-    extents = np.stack([points.min(0), points.max(0)])
+    extents = np.stack(
+        [
+            np.min([scan.points.min(0) for scan in scans], axis=0),
+            np.max([scan.points.max(0) for scan in scans], axis=0),
+        ]
+    )
     bases = draw_bases(features, extents, stream(seed, "basis points"))
     parts = [
         local_features(scan, part, features, bases)

@@ -111,7 +111,7 @@ def _save(part: Path, folder: str, name: str, shot: Shot) -> None:
         "objects": _objects(shot),
     }
     from scipy.io import (
-        savemat,  # this import takes a quarter of a second, and reading the data does not need it
+        savemat,  # reading the data does not need this import
     )
 
     content = io.BytesIO()

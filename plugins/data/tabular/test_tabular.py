@@ -601,8 +601,8 @@ def test_missing_inputs_are_filled_as_scikit_learn_does(tmp_path: Path) -> None:
     absent = {name: [None if np.isnan(cell) else cell for cell in named[name]] for name in "abc"}
     marked = np.column_stack([rows, np.isnan(rows[:, :2])])
     computed = Standardise(new._input_columns.scaling, new._input_columns.fill)(torch.from_numpy(marked))
-    given = [other, named, absent, rows, rows[0], marked]
-    for inputs_of_new in (*(new.inputs(user_data) for user_data in given), computed):
+    user_inputs = [other, named, absent, rows, rows[0], marked]
+    for inputs_of_new in (*(new.inputs(user_data) for user_data in user_inputs), computed):
         np.testing.assert_allclose(inputs_of_new, expected[: len(inputs_of_new)], atol=1e-6)
 
 

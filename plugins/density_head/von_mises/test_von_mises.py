@@ -474,7 +474,7 @@ def test_concentration_of_moments_inverts_the_moments(concentration):
 
 @pytest.mark.parametrize("power", range(-307, 0, 17))
 def test_concentration_of_moments_is_finite_for_every_deviation(power):
-    """For a small deviation V, κ = 1/2V + 1/4 + O(V) (Mardia & Jupp 2000, 5.3.10)."""
+    """Check small deviations V, for which κ = 1/2V + 1/4 + O(V) (Mardia & Jupp 2000, 5.3.10)."""
     deviation = torch.tensor(10.0**power, dtype=torch.float64)
     concentration = functions.concentration_of_moments(1 - deviation, deviation)
     assert concentration.item() == pytest.approx(

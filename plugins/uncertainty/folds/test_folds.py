@@ -285,8 +285,8 @@ def test_every_head_of_a_number_is_narrowed_or_says_why_not():
             assert wrapper.eval()(inputs).log_prob(target).isfinite().all()
     assert remarks.keys() >= {"gaussian", "student_t", "evidential", "quantiles", "mixture", "cvae"}
     for name, remark in remarks.items():
-        said = "the powers of its densities are not known" if name == "quantiles" else "has the temperature"
-        assert said in remark, name
+        words = "the powers of its densities are not known" if name == "quantiles" else "has the temperature"
+        assert words in remark, name
 
 
 def test_mixtures_that_are_not_narrowed_say_why():
