@@ -9,8 +9,10 @@ from torch import Tensor, nn
 
 POINTWISE = (nn.ReLU, nn.ELU, nn.SiLU)
 """Layers that change each number on its own and have no weights."""
-ROWS = 128
+ROWS = 64
 """Number of samples that are computed at once without gradient, so that the outputs of a layer stay in the cache."""
+NARROW = 16
+"""Number of outputs below which a product is computed faster from transposed weights and numbers."""
 POOL = 2**20
 """Number of random dropout factors that are kept in addition to the number that one layer needs.
 
@@ -63,7 +65,7 @@ class Chain(nn.Module):
         layer = 0
         for step in self.steps:
             if isinstance(step, nn.Linear):
-                numbers = torch.baddbmm(self.biases[layer], numbers, self.weights[layer])
+                numbers = _affine(numbers, self.weights[layer], self.biases[layer])
                 layer += 1
             elif isinstance(step, nn.Dropout):
                 numbers = self._drop(numbers, step.p) if self.training else numbers
@@ -99,6 +101,17 @@ class Chain(nn.Module):
     def forget_masks(self) -> None:
         """Free the memory of the random dropout factors."""
         self._pools.clear()
+
+
+def _affine(
+    numbers: Float[Tensor, "member batch length"],
+    weight: Float[Tensor, "member length size"],
+    bias: Float[Tensor, "member 1 size"],
+) -> Float[Tensor, "member batch size"]:
+    """Return numbers @ weight + bias."""
+    if weight.shape[2] >= NARROW or torch.is_grad_enabled() or torch.compiler.is_exporting():
+        return torch.baddbmm(bias, numbers, weight)
+    return torch.baddbmm(bias.mT, weight.mT.contiguous(), numbers.mT).mT
 
 
 @torch.no_grad()

@@ -18,7 +18,7 @@ from framework.storage.weights import describe_mismatch
 from framework.target import Target
 from framework.testing.plain import Plain
 from framework.uncertainty import held_out
-from plugins.uncertainty.folds.chain import build_chain
+from plugins.uncertainty.folds.chain import NARROW, ROWS, Chain, build_chain
 from plugins.uncertainty.folds.groups import Apart, Together
 from plugins.uncertainty.folds.training import Training, assign_folds
 from plugins.uncertainty.folds.wrapper import PSEUDO, fit_log_weights, fit_model_share, pool_temperature
@@ -70,13 +70,29 @@ def test_each_sample_is_predicted_by_models_that_did_not_see_it():
     batch = {"input": inputs, "target": target, "row": rows}
     (density,) = predict_densities(wrapper, [batch])
     assert density.log_prob(target).mean().item() == pytest.approx(-loss, rel=1e-6)
-    groups = wrapper.models.densities(inputs)
+    with torch.no_grad():  # as in predictions, whose products are computed in another order
+        groups = wrapper.models.densities(inputs)
     expected = torch.stack([part.log_prob(target.unsqueeze(1))[rows, wrapper._fold] for part in groups], 1)
     torch.testing.assert_close(density.log_prob(target), torch.logsumexp(expected + wrapper.log_weights, 1))
     whole = torch.stack([part.log_prob(target.unsqueeze(1)).logsumexp(1) - math.log(3) for part in groups], 1)
-    torch.testing.assert_close(
-        wrapper(inputs).log_prob(target), torch.logsumexp(whole + wrapper.log_weights, 1)
-    )
+    with torch.no_grad():
+        mixture = wrapper(inputs)
+    torch.testing.assert_close(mixture.log_prob(target), torch.logsumexp(whole + wrapper.log_weights, 1))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_predictions_without_gradient_are_those_of_training(dtype):
+    """Both kinds of products, and samples in one block, in full blocks and in a block that is not full."""
+    for outputs in (1, 2, NARROW - 1, NARROW):
+        networks = [nn.Sequential(nn.Linear(3, 20), nn.SiLU(), nn.Linear(20, outputs)) for _ in range(2)]
+        chain = Chain([network.to(dtype) for network in networks], [None])
+        for samples in (0, 1, ROWS, 2 * ROWS + 1):
+            inputs = torch.randn(samples, 3, dtype=dtype)
+            with torch.no_grad():
+                predicted = chain(inputs)
+            expected = torch.stack([network(inputs) for network in networks])
+            torch.testing.assert_close(chain(inputs), expected)
+            torch.testing.assert_close(predicted, expected)
 
 
 def test_gradients_of_a_sample_reach_no_model_that_predicts_it_held_out():
