@@ -71,6 +71,26 @@ def test_a_loaded_model_does_not_ask_for_what_its_training_started_from(
         loading.load(tmp_path / "model.ckpt")
 
 
+@pytest.mark.parametrize(
+    ("module", "message"),
+    [
+        ("plugins.encoder.mine", r"a plugin failed at plugins\S*:2 \(RuntimeError: .*\. Mend the plugin if"),
+        ("torch.nn.mine", r"cannot be read as a checkpoint"),
+    ],
+)
+@pytest.mark.parametrize("part", ["build_predictor", "build_data"])
+def test_an_error_while_a_model_is_built_leads_to_the_plugin_that_failed(
+    part: str, module: str, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    space: dict[str, Any] = {"__name__": module, "torch": torch}
+    exec(compile("def fail(*_):\n return torch.zeros(2) @ torch.zeros(3)\n", f"{module}.py", "exec"), space)
+    monkeypatch.setattr(loading, part, space["fail"])
+    config = {"encoder": [], "data": resolve("data", "moons")}
+    described = Description(config, Target("class", ("a", "b")), (2,), (), synthetic=True, path="model.ckpt")
+    with pytest.raises(CheckpointError, match=rf"^model\.ckpt: .*{message}"):
+        loading.rebuild(described, {}) if part == "build_predictor" else loading.reader(described)
+
+
 def test_other_data_are_refused_in_a_sentence_however_many_numbers_they_have() -> None:
     mesh, twin = (Target("real", tuple(f"{axis}{row}" for row in range(999))) for axis in "xy")
     described, data = Description({}, mesh, (5,), (), synthetic=True), build("data", resolve("data", "moons"))

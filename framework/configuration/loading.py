@@ -1,7 +1,7 @@
 """Loading of a trained model from a run folder, a checkpoint file or an MLflow run id, without Hydra."""
 
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from threading import get_ident
@@ -158,8 +158,11 @@ def reader(description: Description, chosen: Data | None = None) -> Data:
         chosen: Data set that the caller has built already, and which is then returned; None: it is built from the
             description.
     """
-    with translate_errors(
-        Path(description.path), "a checkpoint of this framework", FOREIGN, kind=CheckpointError
+    with (
+        translate_errors(
+            Path(description.path), "a checkpoint of this framework", FOREIGN, kind=CheckpointError
+        ),
+        blame_plugin(description.path),
     ):
         try:
             data = (
@@ -244,8 +247,11 @@ def rebuild(description: Description, state: Mapping[str, torch.Tensor]) -> Pred
     Raises:
         CheckpointError: The weights belong to another model.
     """
-    with translate_errors(
-        Path(description.path), "a checkpoint of this framework", FOREIGN, kind=CheckpointError
+    with (
+        translate_errors(
+            Path(description.path), "a checkpoint of this framework", FOREIGN, kind=CheckpointError
+        ),
+        blame_plugin(description.path),
     ):
         parts = description.config
         for part in parts["encoder"]:
@@ -258,6 +264,32 @@ def rebuild(description: Description, state: Mapping[str, torch.Tensor]) -> Pred
             fill(predictor, state, description.path)
     bound_first_prediction(predictor, description.path)
     return predictor.eval()
+
+
+@contextmanager
+def blame_plugin(path: str) -> Iterator[None]:
+    """Convert an error that passes through a plugin to an error that names the line of the plugin.
+
+    Args:
+        path: Path of the checkpoint whose model is built in the block.
+
+    Raises:
+        CheckpointError: A plugin failed.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        place = registry.plugin_line(error)
+        if not place:
+            raise
+        fault = f"{type(error).__name__}: {shorten(error)}".removesuffix(": ")
+        raise CheckpointError(
+            f"{path}: the model of this checkpoint cannot be built, because a plugin failed at {place} ({fault}). Mend "
+            "the plugin if it has changed since the training. Otherwise the file is damaged or was not written by this "
+            "framework: do not use it."
+        ) from error
 
 
 def bound_first_prediction(predictor: Predictor, path: str) -> None:
