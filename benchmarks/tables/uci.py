@@ -297,9 +297,9 @@ def table_of_targets(rows: list[dict[str, Any]]) -> list[str]:
             f"{sum(processors) / 2:.1f}" if len(processors) == SPLITS else "not measured",
             *("not measured" if number is None else f"{number / 1000:.4f}" for number in microseconds),
         ]
-        covered = mean(row["coverage_90"] for row in own)
+        covered = with_error([row["coverage_90"] for row in own])
         worst = f"{min(scores):.2f} | {min(row['log_likelihood'] for row in other):.2f}"
-        cells = [name, with_error(scores), f"≥ {TARGETS[name]:.2f}", f"{covered:.3f}", worst, *times]
+        cells = [name, with_error(scores), f"≥ {TARGETS[name]:.2f}", covered, worst, *times]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 
@@ -376,9 +376,7 @@ def page(root: Path) -> None:
         "time of a prediction is the "
         "processor time of a row in a batch of 2000 rows by the frozen model on one thread, a median over "
         f"{TIMED} splits; the last column also includes the point prediction, which is the median of "
-        "the density. Measured in turns "
-        "on one model of yacht, a density took 0.0109 ms, and 0.0108 ms without narrowing. A run trains at least 3000 "
-        f"steps and {epochs_of(rows)} epochs.",
+        f"the density. A run trains at least 3000 steps and {epochs_of(rows)} epochs.",
         "",
     ]
     for name in SETS:
