@@ -11,7 +11,7 @@ from pathlib import Path
 from framework.errors import ConfigError, UserError
 from framework.storage.closed_pipes import survive_closed_pipes
 from framework.storage.log_messages import PlainLogRecord
-from framework.storage.threads import wait_passively
+from framework.storage.threads import limit_spinning
 
 START = """\
 python -m framework experiment=pascal3d/scvae     train, test and report
@@ -57,7 +57,7 @@ def main() -> None:
     The exit code is 0 for success, 1 for a failure, 2 for a command or config that is refused, 129 if the terminal was
     closed, 130 after an interruption (Ctrl-C), and 143 after SIGTERM.
     """
-    wait_passively()
+    limit_spinning()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # printing a table must not fail on a terminal without ±
             stream.reconfigure(errors="backslashreplace")

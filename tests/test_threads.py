@@ -6,23 +6,24 @@ import time
 
 import pytest
 
-from framework.storage.threads import Pool, wait_passively
+from framework.storage.threads import SPINS, Pool, limit_spinning
 
 
 @pytest.mark.parametrize(
-    ("set_by_user", "policy"),
-    [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE"), ({"GOMP_SPINCOUNT": "2000"}, None)],
+    ("set_by_user", "spins"),
+    [({}, SPINS), ({"OMP_WAIT_POLICY": "ACTIVE"}, None), ({"GOMP_SPINCOUNT": "2000"}, "2000")],
 )
-def test_openmp_waits_passively_unless_the_user_says_otherwise(
-    set_by_user: dict[str, str], policy: str | None, monkeypatch: pytest.MonkeyPatch
+def test_openmp_threads_soon_sleep_unless_the_user_says_otherwise(
+    set_by_user: dict[str, str], spins: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT"):
         monkeypatch.setenv(name, "")  # so that it is put back afterwards
         monkeypatch.delenv(name)
     for name, value in set_by_user.items():
         monkeypatch.setenv(name, value)
-    wait_passively()
-    assert os.environ.get("OMP_WAIT_POLICY") == policy
+    limit_spinning()
+    assert os.environ.get("GOMP_SPINCOUNT") == spins
+    assert os.environ.get("OMP_WAIT_POLICY") == set_by_user.get("OMP_WAIT_POLICY")
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])

@@ -19,9 +19,11 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +49,7 @@ STEP = "a step with its share of validations and checkpoints, ms"
 FLOOR_TABLE = TABLE.with_stem("main_job_floor")
 FLOOR_HEADING = "## What cannot be saved: the convolutions"
 FLOOR_ROUNDS = 3
+FLOOR_THREADS = (1, 2)
 PRECISIONS = ("32-true", "bf16-mixed")
 STEPS = 80
 """Number of training steps of an epoch: 1,266 images in batches of 16."""
@@ -71,9 +74,26 @@ def source(commit: str | None) -> Iterator[Path]:
         git = ["git", "-C", str(ROOT), "worktree"]
         subprocess.run([*git, "add", "--detach", str(tree), commit], check=True, capture_output=True)
         try:
+            write_metadata(tree)
             yield tree
         finally:
             subprocess.run([*git, "remove", "--force", str(tree)], check=True, capture_output=True)
+
+
+def write_metadata(tree: Path) -> None:
+    """Write the metadata of the package in a work tree, so that Python finds its plugins instead of the installed ones.
+
+    Python reads the entry points of a package from the first folder of its search path that holds its metadata.
+    """
+    project = tomllib.loads((tree / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    name, version = project["name"], project["version"]
+    folder = tree / f"{name.replace('-', '_')}-{version}.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    lines: list[str] = []
+    for group, entries in project["entry-points"].items():
+        lines += [f"[{group}]", *(f"{key} = {value}" for key, value in entries.items())]
+    (folder / "entry_points.txt").write_text("\n".join(lines) + "\n")
 
 
 @dataclass(frozen=True)
@@ -233,22 +253,22 @@ def main_model() -> Any:
 
 
 def measure_floor() -> list[dict[str, Any]]:
-    """Return the processor milliseconds of each part of a training step on one thread, round after round."""
+    """Return the wall milliseconds of each part of a training step on one and on two threads, round after round."""
     import torch
 
-    torch.set_num_threads(1)
     rows = []
-    for precision in PRECISIONS:
+    for threads, precision in product(FLOOR_THREADS, PRECISIONS):
+        torch.set_num_threads(threads)
         loops = {
             "convolutions": convolution_step(precision),
             "network": network_step(precision, trains=False),
             "loop": network_step(precision, trains=True),
         }
         for _ in range(FLOOR_ROUNDS):
-            others = cores_used_by_others()
+            key = {"threads": threads, "precision": precision, "others": cores_used_by_others()}
             for name, step in loops.items():
-                spent = milliseconds(step, 40, time.process_time)
-                rows.append({"precision": precision, "part": name, "milliseconds": spent, "others": others})
+                spent = milliseconds(step, 40, time.perf_counter)
+                rows.append({**key, "part": name, "milliseconds": spent})
     return [{**row, "where": environment("torch")} for row in rows]
 
 
@@ -256,31 +276,32 @@ def floor_section(rows: Sequence[dict[str, Any]]) -> list[str]:
     """Return the section of the page on the floor of the run time."""
     lines = [
         f"A training of {FULL} epochs has {FULL * STEPS:,} steps on batches of {BATCH} images. The table gives the "
-        "processor time of a step on one thread, and of the parts that a step consists of; each row contains the "
-        "rows above it. The convolutions are those of PyTorch, called with random numbers of the shapes that they "
-        f"get in training. Each number is the median of {FLOOR_ROUNDS} rounds (least to largest), in which the rows "
-        f"are measured one after the other. The times of all {FULL * STEPS:,} steps follow from these numbers. The "
-        "command also needs time for its start, the reading of images, validations, the test and figures.",
+        "wall time of a step, and of the parts that a step consists of; each row contains the rows above it. The "
+        "convolutions are those of PyTorch, called with random numbers of the shapes that they get in training. Each "
+        f"number is the median of {FLOOR_ROUNDS} rounds (least to largest), in which the parts of a step are measured "
+        f"one after the other. The times of all {FULL * STEPS:,} steps follow from these numbers. The command also "
+        "needs time for its start, the reading of images, validations, the test and figures.",
         "",
-        "| part of a step | 32-true, ms | all steps, s | bf16-mixed, ms | all steps, s |",
-        "|---|---:|---:|---:|---:|",
+        "| threads | part of a step | 32-true, ms | all steps, s | bf16-mixed, ms | all steps, s |",
+        "|---|---|---:|---:|---:|---:|",
     ]
-    for part, name in SHARES.items():
+    for threads, (part, name) in product(FLOOR_THREADS, SHARES.items()):
         cells = []
         for precision in PRECISIONS:
+            key = (threads, precision, part)
             times = [
-                row["milliseconds"] for row in rows if (row["precision"], row["part"]) == (precision, part)
+                row["milliseconds"] for row in rows if (row["threads"], row["precision"], row["part"]) == key
             ]
             cells += [median_and_range(times), f"{FULL * STEPS * statistics.median(times) / 1e3:.0f}"]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
+        lines.append(f"| {threads} | {name} | {' | '.join(cells)} |")
     return [
         *lines,
         "",
-        "The project wants the main job in 60 s of wall time and 120 s of processor time. A faster framework cannot "
-        "reach 60 s on one core: a plain loop takes longer, and in `32-true` the convolutions alone take longer too.",
+        "The project wants the main job in 60 s of wall time and 120 s of processor time. In `32-true` a faster "
+        "framework cannot reach this on two cores, because a plain loop alone takes longer.",
         "",
         "Before the rounds, other processes used "
-        f"{median_and_range([row['others'] for row in rows], 2)} cores, which lengthens processor times.",
+        f"{median_and_range([row['others'] for row in rows], 2)} cores.",
         "",
         f"Measured on {rows[0]['where']} Command: `python -m benchmarks.framework.main_job --floor`.",
     ]
@@ -340,8 +361,8 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         "The main job is `python -m framework experiment=pascal3d/scvae` with all its default settings: it trains an "
         "sCVAE on generated images of cars, tests it, draws its figures and sends the run to MLflow. This page says "
         "how long each part takes, and whether a faster run has the same error. `before` is the version of commit "
-        f"`{BEFORE}`, which trains in float32 (`32-true`) with two threads. `after` is the version at the date of "
-        "this page, which trains with one thread, in float32 by default and in bfloat16 with "
+        f"`{BEFORE}`, which trains in float32 (`32-true`). `after` is the version at the date of "
+        "this page, which trains in float32 by default and in bfloat16 with "
         "`trainer.precision=bf16-mixed`. The value `auto` means `bf16-mixed` on a processor that multiplies bfloat16 "
         "numbers fast.",
         "",
