@@ -144,8 +144,7 @@ def page() -> None:
         "This page compares the recommended start for tables with gradient boosting of scikit-learn in its default "
         "settings. The recommended start is `python -m framework experiment=tabular/regression` or "
         "`experiment=tabular/classification`, to which only the path of a CSV file and the name of a column are given. "
-        "Both see the same rows. The results for real targets are those of `uncertainty.folds.sharpen=false`, from "
-        "before the recommended start narrowed its mixtures.",
+        "Both see the same rows.",
         "",
         "Log-likelihoods are means over the test rows (15 % of a table), in nats and in the unit of the target; higher "
         f"is better. The table gives their mean over {SEEDS} random splits, with its standard error. The difference is "
