@@ -118,6 +118,17 @@ def page() -> None:
         "that of a method minus one network, paired by run, with its standard error. No setting was tuned, but the "
         "rows with the noise 0.5 on concrete (noisier inputs) were added after the results of the other rows were "
         "known.",
+        "",
+        "**Which method wins at which run time.** Each line of the list is for one data set. It names the methods in "
+        "the order of their run time per row, from the fastest on. A method is named only if its log-likelihood is "
+        "higher than that of every faster method by more than two standard errors of the difference, paired by run. "
+        "The log-likelihood is in brackets. [uncertainty](../tables/uncertainty.md) compares a student with all other "
+        "wrappers.",
+        "",
+        *(
+            f"- {HEADINGS[name]}: {winners(name, [row for row in rows if row['set'] == name])}."
+            for name in SETS
+        ),
     ]
     texts = {
         "moons": "The seed of a run also determines its data. The network has two layers of 512 units "
@@ -162,6 +173,28 @@ def table(name: str, rows: Sequence[dict[str, Any]]) -> list[str]:
         cells.append(f"{1000 * mean(row['milliseconds_per_sample'] for row in own):.3g}")
         lines.append(f"| {method} | {' | '.join(cells)} |")
     return lines
+
+
+def winners(name: str, rows: Sequence[dict[str, Any]]) -> str:
+    """Return the methods that are better than every faster one, from the fastest on, with their log-likelihoods."""
+
+    def values(method: str) -> list[float]:
+        own = sorted((row for row in rows if row["method"] == method), key=lambda row: row["run"])
+        return [row["log_likelihood"] if "log_likelihood" in row else -row["nll"] for row in own]
+
+    costs = {
+        method: mean(1000 * row["milliseconds_per_sample"] for row in rows if row["method"] == method)
+        for method in SETS[name]
+    }
+    ranked = sorted(costs, key=lambda method: costs[method])
+    named = ranked[:1]
+    for method in ranked[1:]:
+        gains = [own - best for own, best in zip(values(method), values(named[-1]), strict=True)]
+        if mean(gains) > 2 * stdev(gains) / len(gains) ** 0.5:
+            named.append(method)
+    return ", ".join(
+        f"from {costs[method]:.3g} µs {method} ({mean(values(method)):.3f} nats)" for method in named
+    )
 
 
 def spread(values: Sequence[float]) -> str:

@@ -2,7 +2,7 @@
 
     python -m benchmarks.densities.outlier_scores measure moons
     python -m benchmarks.densities.outlier_scores measure digits /path/to/digits /path/to/COIL20
-    python -m benchmarks.densities.outlier_scores page           # writes outlier_scores.md
+    python -m benchmarks.densities.outlier_scores page           # writes outlier_scores.md and its figure
 
 The digits are idx files as for `benchmarks.images.digits`, and COIL-20 is in the form of data=coil20. `measure` trains
 one model for each seed, and writes one line for each score and set of outliers into outlier_scores_runs.csv.
@@ -51,6 +51,13 @@ MOONS_EPOCHS, DIGITS_EPOCHS = 100, 3
 ROUNDS = 5
 """Number of repetitions of a timed prediction."""
 TABLE = Path(__file__).with_name("outlier_scores_runs.csv")
+FIGURE = Path(__file__).with_name("outlier_scores.png")
+KINDS = {
+    "far from both moons": "moons (synthetic)",
+    "digits 8 and 9": "digits 8 and 9 (real)",
+    "objects": "objects among digits (real)",
+}
+"""Panels of the figure: kinds of outliers, with their titles."""
 Batches = dict[str, Any]
 
 
@@ -177,6 +184,7 @@ def test(
 def page() -> None:
     """Write the page from the recorded runs."""
     rows: list[dict[str, Any]] = read_rows(TABLE)
+    draw(rows)
     lines = [
         "# Scores that recognise outliers",
         "",
@@ -188,6 +196,22 @@ def page() -> None:
         "of the training and of the data (for digits, of their split), and ± is the standard deviation over "
         "seeds. The settings are the defaults of `feature_score`, except where the name of the score says "
         "otherwise. No setting was tuned.",
+        "",
+        "![AUROC of outliers against processor time](outlier_scores.png)",
+        "",
+        "*Share of pairs of an outlier and a test sample that a score orders wrongly (1 - AUROC), against the time of "
+        "density and score. Bars are standard deviations over seeds. The grey line is the best result of all scores "
+        "that are at least as fast.*",
+        "",
+        "**Which score wins at which run time.** Each line of the list is for one kind of outliers. It names the "
+        "scores in the order of their run time, from the fastest on. A score is named only if its AUROC is higher "
+        "than ½ and than that of every faster score, by more than the standard deviations of both over seeds. Times "
+        "that differ by less than a tenth are equal within their noise.",
+        "",
+        *(
+            f"- {title}: {winners([row for row in rows if row['outliers'] == kind])}."
+            for kind, title in KINDS.items()
+        ),
     ]
     for data, heading in (
         ("moons", "Moons (synthetic)"),
@@ -234,6 +258,61 @@ def table(rows: Sequence[dict[str, Any]]) -> list[str]:
         lines.append((mean(auroc), f"| {score} | {spread(auroc)} | {spread(fpr)} | {cost:.3g} |"))
     head = ["| score | AUROC | FPR95 | µs / row |", "|---|---:|---:|---:|"]
     return [*head, *(line for _, line in sorted(lines, key=lambda pair: -pair[0]))]
+
+
+def result(rows: Sequence[dict[str, Any]], score: str) -> tuple[float, float, float]:
+    """Return the mean run time of a score, µs, its mean AUROC, and the standard deviation of the AUROC over seeds."""
+    own = [row for row in rows if row["score"] == score]
+    areas = [row["auroc"] for row in own]
+    return mean(row["microseconds"] for row in own), mean(areas), stdev(areas)
+
+
+def winners(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the scores that are clearly better than every faster one, from the fastest on, with AUROC and time."""
+    best, noise, parts = 0.5, 0.0, []
+    for (duration, area, deviation), score in sorted((result(rows, score), score) for score in SCORES):
+        if area > best + max(deviation, noise):
+            best, noise = area, deviation
+            parts.append(f"from {duration:.3g} µs {score} ({area:.3f})")
+    return ", ".join(parts)
+
+
+def draw(rows: Sequence[dict[str, Any]]) -> None:
+    """Draw 1 - AUROC of each score against its run time, with one panel for each kind of outliers."""
+    from matplotlib.lines import Line2D
+    from matplotlib.ticker import FixedLocator, NullFormatter
+
+    from framework.figures.style import COLOURS, GREY, MARKERS, save_figure, titled_figure
+
+    figure = titled_figure(
+        (13, 4.2), "Scores that recognise outliers: error against run time", synthetic=False
+    )
+    panels = figure.subplots(1, len(KINDS))
+    styles = {score: (MARKERS[n], COLOURS[n % len(COLOURS)]) for n, score in enumerate(SCORES)}
+    for axes, (kind, title) in zip(panels, KINDS.items(), strict=True):
+        own = [row for row in rows if row["outliers"] == kind]
+        results = {score: result(own, score) for score in SCORES}
+        for score, (duration, area, deviation) in results.items():
+            marker, colour = styles[score]
+            axes.errorbar(duration, 1 - area, deviation, marker=marker, color=colour, ls="")
+        ranked = sorted(results.values())
+        times = [duration for duration, _, _ in ranked]
+        best = [1 - max(area for _, area, _ in ranked[: end + 1]) for end in range(len(ranked))]
+        axes.step([*times, 2 * times[-1]], [*best, best[-1]], where="post", color=GREY, zorder=0, lw=1)
+        limits = (times[0] / 1.5, 1.5 * times[-1])
+        axes.set(xscale="log", title=title, xlabel="processor time per row, µs", xlim=limits)
+        axes.xaxis.set_major_locator(FixedLocator([5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000]))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.set_ylim(-0.03 * axes.get_ylim()[1], None)  # so that no marker at 0 is cut off
+    panels[0].set_ylabel("1 - AUROC (lower is better)")
+    handles = [
+        Line2D([], [], color=colour, ls="", marker=marker, label=score)
+        for score, (marker, colour) in styles.items()
+    ]
+    handles.append(Line2D([], [], color=GREY, label="best so far"))
+    figure.legend(handles=handles, loc="outside right center")
+    save_figure(figure, FIGURE.with_suffix(""), True)
 
 
 def spread(values: Sequence[float]) -> str:

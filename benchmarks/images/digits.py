@@ -259,7 +259,7 @@ def with_spread(values: Sequence[float]) -> str:
 
 
 def likelihood_table(sweep: str) -> tuple[list[str], str]:
-    """Return the table of log-likelihoods on ambiguous digits, and a sentence about the target."""
+    """Return the table of log-likelihoods on ambiguous digits, and sentences about run time and the aim."""
     runs = runs_by_head(sweep)
     scores = {head: [result["log_likelihood"] for _, result in runs[head]] for head in HEADS}
     lines = [
@@ -286,7 +286,23 @@ def likelihood_table(sweep: str) -> tuple[list[str], str]:
         for head, gain in gains.items()
         if abs(gain - LEAST_GAIN) < stdev(scores[head])
     ]
-    return lines, f"The aim was a gain of {LEAST_GAIN} nats. {' and '.join(words)}.{''.join(undecided)}"
+    aim = f"The aim was a gain of {LEAST_GAIN} nats. {' and '.join(words)}.{''.join(undecided)}"
+    return lines, f"{winners(runs)}\n\n{aim}"
+
+
+def winners(runs: Mapping[str, Sequence[Run]]) -> str:
+    """Return the sentence that says which density head has the highest log-likelihood at which run time."""
+    best, parts = -math.inf, []
+    costs = {head: mean(results["milliseconds_per_sample"] for _, results in runs[head]) for head in HEADS}
+    for head in sorted(HEADS, key=lambda head: costs[head]):
+        value = mean(results["log_likelihood"] for _, results in runs[head])
+        if value > best:
+            best = value
+            parts.append(f"{costs[head]:.1f} ms, `{head}` ({value:.2f} nats)")
+    return (
+        "**Which head wins at which run time:** if a prediction may take at least the following time per image, the "
+        f"head with the highest log-likelihood is: {'; '.join(parts)}."
+    )
 
 
 def turns_text() -> str:
