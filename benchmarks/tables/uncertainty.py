@@ -36,8 +36,12 @@ METHODS: dict[str, dict[str, Any]] = {
     "balance 0.5": {"head": {"name": "gaussian", "balance": 0.5}},
     "evidential": {"head": {"name": "evidential"}},
     "student_t": {"head": {"name": "student_t"}},
+    "quantiles": {"head": {"name": "quantiles"}},
+    "distilled": {"teacher": "ensemble"},
 }
 """Methods by name: wrappers, innermost first, and what differs from one Gaussian network (`train`)."""
+TEACHER_WEIGHT, TEACHER_DRAWS = 9.0, 16
+"""Weight of the divergence from the teacher, and number of its draws, as in objective=[distillation]."""
 KNOBS = {
     "mc_dropout": ("samples", (1, 3, 10, 30)),
     "laplace": ("samples", (1, 3, 10, 30)),
@@ -84,7 +88,9 @@ def train(data: Any, batches: dict[str, Any], method: dict[str, Any], seed: int)
     from framework.configuration.assembly import build_predictor
     from framework.configuration.schema import resolve
     from framework.uncertainty import FollowsTraining, reading_training
+    from plugins.objective.distillation.divergence import from_teacher
 
+    teacher = train(data, batches, METHODS[method["teacher"]], seed) if "teacher" in method else None
     default = {"name": "bernoulli" if data.target.kind == "class" else "gaussian"}
     encoder = {"name": "mlp", "widths": [WIDTH], "dropout": method.get("dropout", 0.0)}
     wrappers = [{"name": name, **method.get(name, {})} for name in method.get("uncertainty", [])]
@@ -109,7 +115,13 @@ def train(data: Any, batches: dict[str, Any], method: dict[str, Any], seed: int)
             optimizer.param_groups[0]["lr"] = rate
             rows = order[step * size : (step + 1) * size]
             optimizer.zero_grad()
-            predictor.loss(inputs[rows], target[rows]).mean().backward()
+            loss = predictor.loss(inputs[rows], target[rows]).mean()
+            if teacher is not None:
+                with torch.no_grad():
+                    taught = teacher(inputs[rows])
+                student = predictor.training_densities(inputs[rows])
+                loss = loss + TEACHER_WEIGHT * from_teacher(taught, student, TEACHER_DRAWS).mean()
+            loss.backward()
             torch.nn.utils.clip_grad_norm_(predictor.parameters(), 1.0)
             optimizer.step()
         for follower in followers:
@@ -120,19 +132,21 @@ def train(data: Any, batches: dict[str, Any], method: dict[str, Any], seed: int)
     return predictor
 
 
-def measure(root: Path, name: str, runs: Sequence[int]) -> None:
-    """Record error and processor time of every method on a set, for each value of its knob, in place of old records."""
+def measure(root: Path, name: str, runs: Sequence[int], methods: Sequence[str]) -> None:
+    """Record error and processor time of methods on a set, for each value of the knob, in place of old records."""
     import torch
 
     torch.set_num_threads(1)
     old = read_rows(TABLE) if TABLE.exists() else []
-    rows: list[dict[str, Any]] = [row for row in old if row["data"] != name or row["run"] not in runs]
+    rows: list[dict[str, Any]] = [
+        row for row in old if row["data"] != name or row["run"] not in runs or row["method"] not in methods
+    ]
     for run in runs:
         data, batches = load_data(root, name, run)
-        for label, method in METHODS.items():
-            if name == "moons" and "head" in method:
+        for label in methods:
+            if name == "moons" and "head" in METHODS[label]:
                 continue  # these heads are for real numbers
-            predictor = train(data, batches, method, run)
+            predictor = train(data, batches, METHODS[label], run)
             rows += [
                 {"data": name, "method": label, "run": run, **row} for row in test(predictor, batches, label)
             ]
@@ -140,9 +154,10 @@ def measure(root: Path, name: str, runs: Sequence[int]) -> None:
 
 
 def test(predictor: Any, batches: dict[str, Any], label: str) -> Iterator[dict[str, float]]:
-    """Yield log-likelihood, processor time and, with outliers, AUROC for each value of the method's knob."""
+    """Yield log-likelihood, processor time and, with outliers, AUROCs for each value of the method's knob."""
     import torch
 
+    from framework.distributions.model_mixtures import expected_entropy
     from plugins.metric.out_of_distribution.metric import ranking
 
     knob, values = KNOBS.get(label, ("", (0,)))
@@ -157,10 +172,13 @@ def test(predictor: Any, batches: dict[str, Any], label: str) -> Iterator[dict[s
             density = predictor(batch["input"])
             row = {"knob": value, "log_likelihood": density.log_prob(batch["target"]).mean().item()}
             if "outliers" in batches:
-                scores = [
-                    part.entropy().double() for part in (predictor(batches["outliers"]["input"]), density)
-                ]
-                row["auroc"] = ranking(*scores)["auroc"].item()
+                parts = [predictor(batches["outliers"]["input"]), density]
+                entropies = [part.entropy().double() for part in parts]
+                row["auroc"] = ranking(*entropies)["auroc"].item()
+                if value > 1:  # several models
+                    expected = [expected_entropy(part).double() for part in parts]
+                    shared = [entropy - part for entropy, part in zip(entropies, expected, strict=True)]
+                    row["mutual_information_auroc"] = ranking(*shared)["auroc"].item()
             labels = batch["target"].repeat(
                 ROWS // len(batch["input"]) + 1, *[1] * (batch["target"].dim() - 1)
             )[:ROWS]
@@ -184,9 +202,11 @@ def page() -> None:
         f"with outliers (seeds {', '.join(map(str, RUNS))}). All methods train one layer of {WIDTH} units for {STEPS} "
         f"steps of {BATCH} samples by AdamW (learning rate {RATE:g}, weight decay {DECAY:g}), with a cosine schedule; "
         f"only swag has a constant learning rate, because it needs one. The weights after the last step are "
-        "tested. For the tables, the density head is `gaussian`, unless the method is itself a head: "
-        "`evidential`, `student_t`, or `balance 0.5`, which is `gaussian` trained by the β-NLL with β = 0.5. For "
-        "the moons, the head is `bernoulli`. No setting was tuned for any method. With three runs, differences "
+        "tested. For the tables, the density head is `gaussian`, unless the method is itself a head: `evidential`, "
+        "`student_t`, `quantiles`, or `balance 0.5`, which is `gaussian` trained by the β-NLL with β = 0.5. For the "
+        "moons, the head is `bernoulli`. `distilled` is one network that learns from the five networks of `ensemble`, "
+        "with the divergence of `objective=[distillation]` and its default weight. No setting was tuned for any "
+        "method. With three runs, differences "
         "below two standard errors mean nothing.",
         "",
         "![Log-likelihood against processor time](uncertainty.png)",
@@ -202,7 +222,8 @@ def page() -> None:
         "",
         "Each line of the list is for one data set. It names the methods in the order of their run time per row, from "
         "the fastest on. A method is named only if its log-likelihood is higher than that of one model and of every "
-        "faster method. The gain over one model is in brackets.",
+        "faster method. The gain over one model, in nats, is in brackets, for the smallest and the largest value of "
+        "the knob that is better than all faster methods.",
         "",
         *[winners(rows, name) for name in SETS],
     ]
@@ -215,8 +236,9 @@ def page() -> None:
         ]
     lines += [
         "",
-        "The outliers of the moons lie far from both classes, on one side. AUROC is that of the entropy as a score; "
-        "0.5 is chance, and 0 says that the outliers are predicted more confidently than the test samples.",
+        "The outliers of the moons lie far from both classes, on one side. AUROC is that of the entropy or of the "
+        "mutual information of class and model as a score, where there are several models; 0.5 is chance, and 0 says "
+        "that the outliers are predicted more confidently than the test samples.",
         "",
         f"{machine('torch')} Command: the lines at the top of `benchmarks/tables/uncertainty.py`. Other programs used "
         "the machine at the same time.",
@@ -229,7 +251,7 @@ def curve(rows: list[dict[str, Any]], name: str, method: str) -> list[dict[str, 
     """Return means of a method on a set for each knob value, in ascending order of the value.
 
     Each holds the log-likelihood and its standard error, the gain over one model and the standard error of this paired
-    difference, the time, and the AUROC (NaN without outliers).
+    difference, the time, and the AUROC of entropy and mutual information (NaN without outliers or for one model).
     """
     plain = (name, "one model")
     base = {row["run"]: row["log_likelihood"] for row in rows if (row["data"], row["method"]) == plain}
@@ -248,6 +270,7 @@ def curve(rows: list[dict[str, Any]], name: str, method: str) -> list[dict[str, 
                 "gain_error": stdev(gains) / root,
                 "time": mean(row["microseconds"] for row in part),
                 "auroc": mean(row.get("auroc", math.nan) for row in part),
+                "shared": mean(row.get("mutual_information_auroc", math.nan) for row in part),
             }
         )
     return points
@@ -263,10 +286,11 @@ def table_of_set(rows: list[dict[str, Any]], name: str) -> list[str]:
         last = points[-1]
         gain = f"{last['gain']:+.3f} ± {last['gain_error']:.3f}" if method != "one model" else ""
         cells = [method, f"{last['value']:.3f} ± {last['error']:.3f}", gain, f"{last['time']:.2f}"]
-        cells += [f"{last['auroc']:.3f}"] if name == "moons" else []
+        if name == "moons":
+            cells += [f"{last['auroc']:.3f}", "" if math.isnan(last["shared"]) else f"{last['shared']:.3f}"]
         lines.append((last["value"], f"| {' | '.join(cells)} |"))
     columns = ["method", "log-likelihood, nats", "gain over one model, paired", "µs / row"]
-    columns += ["AUROC of outliers"] if name == "moons" else []
+    columns += ["AUROC, entropy", "AUROC, mutual information"] if name == "moons" else []
     head = [f"| {' | '.join(columns)} |", f"|---|{'---:|' * (len(columns) - 1)}"]
     return [*head, *(line for _, line in sorted(lines, reverse=True))]
 
@@ -276,13 +300,20 @@ def winners(rows: list[dict[str, Any]], name: str) -> str:
     points = [
         (point["time"], point["gain"], method) for method in METHODS for point in curve(rows, name, method)
     ]
-    best, parts, last = 0.0, [], ""
+    best = 0.0
+    steps: list[tuple[str, float, float, float, float]] = []  # method, and first and last time and gain
     for duration, gain, method in sorted(points):
         if gain > best:
             best = gain
-            if method != last:
-                parts.append(f"from {duration:.2g} µs {method} ({gain:+.3f} nats)")
-            last = method
+            if steps and steps[-1][0] == method:
+                steps[-1] = (*steps[-1][:3], duration, gain)
+            else:
+                steps.append((method, duration, gain, duration, gain))
+    parts = [
+        f"from {first:.2g} µs {method} ({low:+.3f}"
+        + (f", and {high:+.3f} from {last:.2g} µs on)" if last > first else ")")
+        for method, first, low, last, high in steps
+    ]
     return f"- {name}: {', '.join(parts)}."
 
 
@@ -328,11 +359,14 @@ def main() -> None:
     parser.add_argument("root", type=Path, nargs="?", help="folder of the UCI sets")
     parser.add_argument("set", choices=SETS, nargs="?")
     parser.add_argument("--runs", type=int, nargs="+", default=list(RUNS), help="runs to measure")
+    parser.add_argument(
+        "--methods", nargs="+", choices=METHODS, default=list(METHODS), help="methods to measure"
+    )
     options = parser.parse_args()
     if options.step == "page":
         page()
     else:
-        measure(options.root, options.set, options.runs)
+        measure(options.root, options.set, options.runs, options.methods)
 
 
 if __name__ == "__main__":
