@@ -16,6 +16,7 @@ import pytest
 
 from framework.bodies import motion
 from framework.datasets.csv_columns import (
+    ColumnChoice,
     LabelledWriting,
     Writing,
     describe_choice,
@@ -296,6 +297,45 @@ def test_row_numbers_are_no_inputs_and_no_angles(tmp_path: Path, name: str, star
     assert any("row numbers" in said for said in table.remarks)
     if name:  # who names it means it
         assert read_table(file, [name], "degrees").columns == (name,)
+
+
+def _choose_columns(tmp_path: Path, lines: list[str]) -> ColumnChoice:
+    file = tmp_path / "one.csv"
+    file.write_text("\n".join(lines), encoding="utf-8")
+    return numeric_columns(read_columns(file, LabelledWriting()), ("y",), "data.columns")
+
+
+@pytest.mark.parametrize("name", INDEX[1:])
+def test_copied_rows_hide_no_row_numbers(tmp_path: Path, name: str) -> None:
+    rows = [f"{100000 + row},{row * row % 7},{row % 2}" for row in range(30)]
+    chosen = _choose_columns(tmp_path, [f"{name},a,y", *rows, rows[4], rows[4]])
+    assert chosen.names == ("a",)
+
+
+@pytest.mark.parametrize("name", INDEX)
+def test_repeated_numbers_are_left_out_only_where_the_name_leaves_no_doubt(tmp_path: Path, name: str) -> None:
+    rows = [f"{row % 20},{row * row % 7},{row % 2}" for row in range(60)]
+    chosen = _choose_columns(tmp_path, [f"{name or 'Unnamed: 7'},a,y", *rows])
+    expected = ("index", "a") if name == "index" else ("row_number", "a") if name == "row_number" else ("a",)
+    assert chosen.names == expected
+
+
+NUMBERS_OF_THINGS = ("customer_id", "PassengerId", "Order No.", "Nr", "Kundennummer", "lfd. Nr.", "caseID")
+
+
+@pytest.mark.parametrize("name", [*NUMBERS_OF_THINGS, "acid", "grid", "milli", "nrooms", "area"])
+def test_a_column_that_may_number_things_is_reported(tmp_path: Path, name: str) -> None:
+    rows = [f"{997 * row % 1009},{row * row % 7},{row % 2}" for row in range(60)]
+    chosen = _choose_columns(tmp_path, [f"{name},a,y", *rows, rows[3]])
+    assert chosen.names == (name, "a")
+    assert ("has another whole number in each row" in chosen.odd.get(name, "")) == (name in NUMBERS_OF_THINGS)
+
+
+@pytest.mark.parametrize("start", [0, 1, 100000])
+def test_a_column_that_counts_from_any_number_is_reported(tmp_path: Path, start: int) -> None:
+    rows = [f"{start + row},{row * row % 7},{row % 2}" for row in range(60)]
+    chosen = _choose_columns(tmp_path, ["case,a,y", *rows])
+    assert f"counts the rows from {start} to {start + 59}" in chosen.odd["case"]
 
 
 def test_a_column_that_counts_the_rows_under_another_name_is_said(tmp_path: Path) -> None:

@@ -45,6 +45,12 @@ INDEX = re.compile(
     r"unnamed: \d+(_level_\d+)?|index|level_\d+|row|rows?[ _.]?(number|name|id|index)s?|rownum|id|idx", re.I
 )
 """Names that pandas, R and databases give to a column that numbers the rows."""
+ALWAYS_INDEX = re.compile(r"unnamed: \d+(_level_\d+)?|row[ _.]?ids?|rownum|id|idx", re.I)
+"""Names among these that nobody gives to a measurement, so that their numbers may occur twice."""
+NUMBER_OF_THING = re.compile(
+    r"(?i:[_ .-](id|nr|no|num|number|key)\.?|^nr\.?|nummer)$|(?<=[a-z])(I[dD]|N[rRo]|Num|Number|Key)$"
+)
+"""Names of columns that often hold the number of a thing: customer_id, PassengerId, Order No., Nr, Kundennummer."""
 
 CELLS_AT_ONCE = 2**9
 """Number of cells that are sorted into columns at once, which is several times as fast as one by one."""
@@ -474,26 +480,36 @@ def numeric_columns(columns: Columns, but: Collection[str], setting: str) -> Col
     """
     names: list[str] = []
     left_out, odd = dict(columns.left_out), {}
-    for name, cells in columns.cells.items():
+    # a row that was copied keeps its number
+    originals = [*dict.fromkeys(zip(*columns.cells.values(), strict=True))]
+    distinct_rows = dict(zip(columns.cells, zip(*originals, strict=True), strict=True)) or columns.cells
+    for name in columns.cells:
         if name in but:
             continue
+        cells = distinct_rows[name]
         is_row_count = _is_row_count(cells)
         if INDEX.fullmatch(name) and _is_distinct_whole(cells):
             left_out[name] = f"row numbers; name it in {setting} to read it"
+        elif ALWAYS_INDEX.fullmatch(name) and _is_whole(cells):
+            left_out[name] = f"row numbers, some of them repeated; name it in {setting} to read it"
         elif mostly_numbers(columns, name) or is_boolean(columns, name):
             names.append(name)
             if is_boolean(columns, name):
                 odd[name] = "holds TRUE and FALSE, read as 1 and 0"
             elif is_row_count:
                 odd[name] = f"counts the rows from {cells[0]} to {cells[-1]}; set {setting} to leave it out"
+            elif NUMBER_OF_THING.search(name) and len(cells) > ENOUGH_ROWS and _is_distinct_whole(cells):
+                odd[name] = (
+                    f"has another whole number in each row; if it only names the rows, set {setting} to leave it out"
+                )
         else:
             left_out[name] = _why_no_numbers(columns, name, setting)
     return ColumnChoice(tuple(names), left_out, odd)
 
 
 def _is_row_count(cells: Sequence[str]) -> bool:
-    """Return whether a column of more than ENOUGH_ROWS cells contains the row numbers, from 0 or from 1."""
-    if len(cells) <= ENOUGH_ROWS or cells[0] not in ("0", "1"):
+    """Return whether a column of more than ENOUGH_ROWS cells counts the rows, from any whole number."""
+    if len(cells) <= ENOUGH_ROWS or not re.fullmatch("[0-9]{1,18}", cells[0]):
         return False
     start = int(cells[0])
     return all(cell == str(number) for number, cell in enumerate(cells, start))
@@ -501,9 +517,13 @@ def _is_row_count(cells: Sequence[str]) -> bool:
 
 def _is_distinct_whole(cells: Sequence[str]) -> bool:
     """Return whether all cells are whole numbers and no number occurs twice."""
-    values = [text.parse_number(cell) for cell in cells]
-    all_whole = all(value is not None and math.isfinite(value) and value.is_integer() for value in values)
-    return all_whole and len(set(values)) == len(values)
+    return _is_whole(cells) and len({text.parse_number(cell) for cell in cells}) == len(cells)
+
+
+def _is_whole(cells: Sequence[str]) -> bool:
+    """Return whether all cells are whole numbers."""
+    values = (text.parse_number(cell) for cell in cells)
+    return all(value is not None and math.isfinite(value) and value.is_integer() for value in values)
 
 
 def _why_no_numbers(columns: Columns, name: str, setting: str) -> str:

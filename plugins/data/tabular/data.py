@@ -170,12 +170,13 @@ class Tabular(Data):
         return self._trained or self._table.inputs
 
     def state_dict(self) -> Mapping[str, Any]:
-        names, scaling, labels, content, fill = self._input_columns
+        names, scaling, labels, content, fill, extent = self._input_columns
         numbers = {name: array.tolist() for name, array in scaling._asdict().items()}
         # a model that an older version stored has neither labels nor the hash of a table
         optional = {"labels": list(labels)} if labels else {}
         optional |= {"content": content} if content else {}
         optional |= {} if fill is None else {"fill": fill.tolist()}
+        optional |= {} if extent is None else {"low": extent[0].tolist(), "high": extent[1].tolist()}
         return {"columns": list(names), **numbers, **optional}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

@@ -43,6 +43,7 @@ from plugins.data.tabular.levels import (
     levels_in_memory,
     name_of,
 )
+from plugins.data.tabular.remarks import Extent, describe_copies, describe_far, describe_untested, report_far
 
 Kind = Literal["class", "real", "degrees", "radians"]
 Missing = Literal["error", "skip", "median"]
@@ -107,6 +108,8 @@ class InputColumns(NamedTuple):
         labels: Classes of the target; () for a target of another kind, or if an older version stored the model.
         content: Hash of the cells of the training table; "" if an older version stored the model.
         fill: Median of each column in the training rows, which replaces missing numbers; None if none may be missing.
+        extent: Smallest and largest number of each column in the training rows; None if an older version stored the
+            model.
     """
 
     names: tuple[str, ...]
@@ -114,6 +117,7 @@ class InputColumns(NamedTuple):
     labels: tuple[str, ...] = ()
     content: str = ""
     fill: Float[np.ndarray, "column"] | None = None
+    extent: Extent | None = None
 
 
 FILL = "data.missing=median"
@@ -131,17 +135,19 @@ def restore_columns(state: Mapping[str, Any]) -> InputColumns:
     are_names = bool(names) and all(isinstance(name, str) for name in names)
     are_names &= isinstance(labels, list | tuple) and all(isinstance(label, str) for label in labels)
     are_names &= isinstance(content, str)
-    fill = None
+    fill = extent = None
     try:
         scaling = Scaling(*(np.array(state[name], np.float64) for name in Scaling._fields))
         fill = np.array(state["fill"], np.float64) if "fill" in state else None
+        if "low" in state:
+            extent = np.array(state["low"], np.float64), np.array(state["high"], np.float64)
     except (KeyError, TypeError, ValueError):
         scaling = Scaling(*(np.zeros(0) for _ in Scaling._fields))
     if (
         not are_names
         or any(
             part.shape != (len(names),) or not np.isfinite(part).all()
-            for part in (*scaling, *([] if fill is None else [fill]))
+            for part in (*scaling, *([] if fill is None else [fill]), *(extent or ()))
         )
         or (scaling.largest <= 0).any()
         or (scaling.deviation <= 0).any()
@@ -150,7 +156,7 @@ def restore_columns(state: Mapping[str, Any]) -> InputColumns:
             f"The stored state of tabular must hold {', '.join(Scaling._fields)} of each input column, but holds "
             "something else. Load another checkpoint, or train the model again."
         )
-    return InputColumns(tuple(names), scaling, tuple(labels), content, fill)
+    return InputColumns(tuple(names), scaling, tuple(labels), content, fill, extent)
 
 
 class Table(NamedTuple):
@@ -256,10 +262,17 @@ def load(
     inputs = fill_missing(inputs, fill)
     scaling, constant = fit_scaling(inputs[fitted_rows])
     scaling = scaling if trained is None else trained.scaling
+    extent = inputs[fitted_rows].min(0), inputs[fitted_rows].max(0)
+    if trained is None:
+        remarks += describe_copies(inputs[rows], values[rows], split, [cells.lines[row] for row in rows])
+    else:
+        extent = trained.extent
+        remarks += describe_far(columns, inputs[rows], extent)
     labels = () if trained is None else trained.labels
     target, encoded = _encode(cells, rows, fitted_rows, values, question, labels)
     if target.kind == "class" and trained is None:
         remarks += compare_classes(target.names, f"{file}, column {question.target[0]!r}")
+        remarks += describe_untested(target.names, values[rows], split)
     if target.kind == "real" and trained is None:
         remarks += _constant_targets(question.target, values[training])
     scaled = as_float32(cells, columns, rows, standardise(inputs[rows], scaling))
@@ -280,7 +293,7 @@ def load(
     )
     return Table(
         target,
-        InputColumns(columns, scaling, target.names if target.kind == "class" else (), content, fill),
+        InputColumns(columns, scaling, target.names if target.kind == "class" else (), content, fill, extent),
         constant_names,
         groups,
         Splits(**parts),
@@ -303,6 +316,7 @@ def read(files: Sequence[Path], columns: InputColumns, writing: Writing | None =
     remedy = None if columns.fill is not None else f"train the model with {FILL}, which fills such cells"
     for cells, inputs in tables(files, columns.names, setting, notation, arrange, remedy):
         inputs = fill_missing(inputs, columns.fill)
+        report_far(columns.names, inputs, columns.extent)
         rows = np.arange(len(inputs))
         parts.append(as_float32(cells, columns.names, rows, standardise(inputs, columns.scaling)))
     inputs = torch.cat(parts)
@@ -335,7 +349,8 @@ def from_memory(user_data: Any, columns: InputColumns) -> Float[Tensor, "row col
             f"{', '.join(columns.names)}."
         ) from error
     rows = as_inputs(_add_marks(rows, columns), (len(columns.names),)).numpy()
-    scaled = standardise(fill_missing(rows, columns.fill), columns.scaling)
+    rows = fill_missing(rows, columns.fill)
+    scaled = standardise(rows, columns.scaling)
     wrong = np.argwhere(~(np.abs(scaled) <= np.finfo(np.float32).max))
     if len(wrong):
         row, column = wrong[0]
@@ -348,6 +363,7 @@ def from_memory(user_data: Any, columns: InputColumns) -> Float[Tensor, "row col
                 else ""
             )
         )
+    report_far(columns.names, rows, columns.extent)
     return torch.from_numpy(scaled.astype(np.float32))
 
 
