@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import ClassVar
 
 import torch
@@ -82,6 +82,25 @@ class FitsInputs(ABC):
         Args:
             batches: inputs of the encoder for all samples of the training split, batch by batch. Batches of point
                 clouds may be padded to different numbers of points.
+        """
+
+
+class ChecksTraining(ABC):
+    """Additional base class of an encoder that compares its settings with the samples of the training split.
+
+    The same rules as for `FitsInputs` hold, but nothing is fitted, so that `mode=encode` accepts the encoder.
+    """
+
+    @abstractmethod
+    def check_training(self, batches: Iterable[Mapping[str, Tensor]]) -> None:
+        """Check the samples before training, and change nothing.
+
+        Args:
+            batches: batches of the whole training split. "input" holds the inputs of this encoder, and "target" the
+                targets, (batch, *event).
+
+        Raises:
+            ConfigError: a setting contradicts the samples; the message names the setting and a better value.
         """
 
 

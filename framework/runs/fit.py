@@ -10,13 +10,13 @@ import pytorch_lightning as pl
 import torch
 from pytorch_lightning.profilers import AdvancedProfiler, PyTorchProfiler, SimpleProfiler
 from rich.console import Console
-from torch import Tensor, nn
 from torch import distributed as dist
+from torch import nn
 
 from framework.configuration.loading import fill, predictor_weights
 from framework.configuration.settings import TRAINER_OURS, CallbackSettings, Settings, device_of
-from framework.data import Data
-from framework.encoder import FitsInputs
+from framework.data import Batch, Data
+from framework.encoder import ChecksTraining, FitsInputs
 from framework.errors import ConfigError
 from framework.model import FrozenFrontEnd, Model, fitted_models, learns
 from framework.runs.job import PRUNED, RECORD
@@ -90,7 +90,9 @@ def fit(session: Session, run: Run) -> Fitted:
 
 @torch.no_grad()
 def _fit_encoders(session: Session) -> None:
-    """Fit the encoders of class `FitsInputs` to the training split, each to the features of those before it.
+    """Fit encoders of class `FitsInputs` to the training split, and let those of class `ChecksTraining` check it.
+
+    Each encoder reads the features of those before it.
 
     Raises:
         ConfigError: such an encoder follows an encoder that is trained.
@@ -104,30 +106,31 @@ def _fit_encoders(session: Session) -> None:
         for encoder in list(model.encoders)[:1]
     ]
     for module in session.predictor.modules():
-        if (
-            isinstance(module, FitsInputs)
-            and module.needs_fit
-            and not any(module is encoder for encoder in (*front, *firsts))
-        ):
+        if _reads_inputs(module) and not any(module is encoder for encoder in (*front, *firsts)):
             raise ConfigError(
-                f"{type(module).__name__} is fitted to the inputs before training, but an encoder that is trained "
-                "precedes it. Put it first in encoder=[...]."
+                f"{type(module).__name__} reads the inputs before training, but an encoder that is trained precedes "
+                "it. Put it first in encoder=[...]."
             )
-    for number, encoder in enumerate(front):
+    places = [(encoder, front[:number]) for number, encoder in enumerate(front)]
+    for encoder, before in [*places, *((encoder, front) for encoder in firsts)]:
         if isinstance(encoder, FitsInputs) and encoder.needs_fit:
-            encoder.fit_inputs(_training_features(session, front[:number]))
-    for encoder in firsts:
-        if isinstance(encoder, FitsInputs) and encoder.needs_fit:
-            encoder.fit_inputs(_training_features(session, front))
+            encoder.fit_inputs(batch["input"] for batch in _training_batches(session, before))
+        if isinstance(encoder, ChecksTraining):
+            encoder.check_training(_training_batches(session, before))
 
 
-def _training_features(session: Session, encoders: Iterable[nn.Module]) -> Iterator[Tensor]:
-    """Yield the features that a chain of encoders returns for each batch of the training split."""
+def _reads_inputs(module: nn.Module) -> bool:
+    """Return whether a module is an encoder that reads the inputs of the training split before training."""
+    return isinstance(module, ChecksTraining) or (isinstance(module, FitsInputs) and module.needs_fit)
+
+
+def _training_batches(session: Session, encoders: Iterable[nn.Module]) -> Iterator[Batch]:
+    """Yield the batches of the training split, with the features of a chain of encoders in place of the inputs."""
     for batch in session.batches().of(session.data.splits().train):
         features = batch["input"]
         for encoder in encoders:
             features = encoder(features)
-        yield features
+        yield {**batch, "input": features}
 
 
 def _fit_at_once(session: Session, run: Run) -> float:

@@ -24,6 +24,7 @@ from framework.flights.estimation import (
 )
 from framework.flights.frames import PARTS, future_frames
 from framework.flights.physics import Constants
+from framework.flights.reference_frame import require_frame
 from framework.flights.trajectories import simulate, simulate_with_jacobian
 from framework.heads.parameters import require_finite
 from framework.storage.weights import require_state
@@ -36,7 +37,6 @@ from plugins.density_head.flights.identification import (
     identify,
     replace_constants,
 )
-from plugins.density_head.flights.reference_frame import require_frame
 
 WINDOWS = 32
 """Largest number of training samples (windows of flights) from which `fit` identifies the constants."""

@@ -24,7 +24,7 @@ NEAR_HEIGHT = 0.05
 """Difference of two heights, m, up to which they count as equal.
 
 Bounces with a larger median deviation from their median height say nothing about the table. If their median height is
-equal to that of the config, `identify` starts from the height in the config.
+equal to that of the config, `require_frame` returns the height in the config.
 """
 OUTSIDE = 0.2
 """Largest share of bounces beyond the ends of the table that is accepted as errors of the observations."""
