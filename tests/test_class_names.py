@@ -1,12 +1,17 @@
 """Tests of the comparison of class names: names that look the same are refused, and similar ones are reported."""
 
+import shutil
 import unicodedata
+from pathlib import Path
 
 import pytest
 
 from framework.datasets.class_names import compare_classes
 from framework.errors import DataError
 from framework.storage.text import INVISIBLE
+from framework.testing.contract import contract
+from framework.testing.data_samples import prepared
+from framework.testing.rows import DataRow
 
 SAME = (
     unicodedata.normalize("NFD", "café one"),
@@ -36,3 +41,21 @@ def test_names_that_differ_in_capital_letters_are_reported() -> None:
     (remark,) = compare_classes(["no", "yes", "No", "no"], "table.csv")
     assert remark.startswith("the classes 'No' and 'no' differ only in capital letters")
     assert compare_classes(["no", "yes", "m2", "m²"], "table.csv") == ()
+
+
+@pytest.mark.parametrize("name", ["image_folder", "turned_images", "point_cloud_folder"])
+def test_a_folder_of_classes_is_compared_as_a_table_is(name: str, tmp_path: Path) -> None:
+    """Give the files of a class to two classes, whose names differ in capital letters or in a blank."""
+    (row, *_) = contract("data", name).rows
+    assert isinstance(row, DataRow) and row.write is not None
+    settings = {"root": row.write(tmp_path)["root"], "validation": 0.1, "test": 0.1}
+    first = min(path for path in tmp_path.iterdir() if path.is_dir())
+    assert not any("capital letters" in x for x in prepared(name, **settings).remarks)
+    shutil.copytree(first, tmp_path / first.name.upper())
+    remarks = prepared(name, **settings).remarks
+    assert any(
+        f"{first.name.upper()}' and '{first.name}' differ only in capital letters" in x for x in remarks
+    )
+    (tmp_path / first.name.upper()).rename(tmp_path / f"{first.name} ")
+    with pytest.raises(DataError, match=f"look the same .'{first.name}'"):
+        prepared(name, **settings)

@@ -4,10 +4,18 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from framework.configuration.schema import build, resolve
 from framework.data import Data
+from framework.datasets.new_files import (
+    DIGITS,
+    READ_WHOLE,
+    Trained,
+    hash_contents,
+    leave_out_trained,
+)
 from framework.errors import ConfigError, DataError
 from framework.testing.contract import contract
 from framework.testing.data_samples import prepared
@@ -30,6 +38,7 @@ SOURCES: dict[str, Callable[[Path], None]] = {
     "image_folder": drop_a_file,
     "turned_images": drop_a_file,
     "point_cloud_folder": drop_a_file,
+    "labelled_points": drop_a_file,
     "images_with_angles": change_a_number,
     "tabular": change_a_number,
 }
@@ -52,14 +61,25 @@ def for_model(trained: Data, name: str, settings: Mapping[str, Any]) -> Data:
     return data
 
 
+def written_anew(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Write files as `written`, but with other random numbers."""
+    generator = np.random.default_rng
+    with monkeypatch.context() as patched:
+        patched.setattr(np.random, "default_rng", lambda seed: generator([seed, 99]))
+        return written(name, folder)
+
+
 def sizes(data: Data) -> list[int]:
-    return [len(part) for part in data.splits()]  # type: ignore[arg-type]
+    """Return the number of files of each split; rows of a table count as files."""
+    return [len(getattr(part, "scans", part)) for part in data.splits()]  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", SOURCES)
-def test_a_trained_model_is_tested_on_all_files_of_another_folder(name: str, tmp_path: Path) -> None:
+def test_a_trained_model_is_tested_on_all_files_of_another_folder(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     trained = prepared(name, **written(name, tmp_path / "first"))
-    settings = written(name, tmp_path / "second")
+    settings = written_anew(name, tmp_path / "second", monkeypatch)
     SOURCES[name](tmp_path / "second")
     share = for_model(trained, name, settings)
     share.prepare()
@@ -72,7 +92,59 @@ def test_a_trained_model_is_tested_on_all_files_of_another_folder(name: str, tmp
     every.prepare()
     assert sizes(every) == [0, 0, count]
     assert every.target.names == trained.target.names
-    assert not any("data.test=1" in remark for remark in every.remarks)
+    assert not any("data.test=1" in x or "trained on" in x for x in every.remarks)
+
+
+@pytest.mark.parametrize("name", sorted(SOURCES.keys() - {"tabular"}))
+def test_files_that_the_model_was_trained_on_are_not_tested(name: str, tmp_path: Path) -> None:
+    """Test on a copy of the training folder with one file less, or with another table."""
+    trained = prepared(name, **written(name, tmp_path / "first"))
+    settings = written(name, tmp_path / "second")
+    SOURCES[name](tmp_path / "second")
+    fewer = SOURCES[name] is drop_a_file
+    every = for_model(trained, name, {**settings, "test": 1})
+    every.prepare()
+    tested, of_training = sizes(every)[2], sizes(trained)[2]
+    assert of_training - fewer <= tested <= of_training
+    left_out = sum(sizes(trained)) - fewer - tested
+    assert f"left out of the test: {left_out} files that the model was trained on" in every.remarks
+    if name == "images_with_angles":  # the name of a file chooses its split, which is that of the training
+        return
+    share = for_model(trained, name, {**settings, "test": 0.5})
+    share.prepare()
+    assert 0 < sizes(share)[2] < sum(sizes(trained)) // 2
+    assert any(x.startswith("left out of the test: ") for x in share.remarks)
+
+
+def test_test_files_that_a_folder_states_are_counted_and_tested() -> None:
+    hashes = [f"{number:016x}" for number in range(4)]
+    splits = np.array(["train", "validation", "test", "test"])
+    trained = Trained.on("first", (), hashes, splits)
+    assert trained.has([*hashes, "0" * 15 + "9"]).tolist() == [True, True, False, False, False]
+    every, source = np.full(4, "test"), Path("folder")
+    chosen, remarks = leave_out_trained(every, every, hashes, trained, "second", source)
+    assert chosen.tolist() == every.tolist()
+    assert "2 of the 4 test files have the content of files for training or validation" in remarks[0]
+    unstated = np.full(4, "")
+    chosen, remarks = leave_out_trained(unstated, every, hashes, trained, "second", source)
+    assert chosen.tolist() == ["left out", "left out", "test", "test"] and len(remarks) == 1
+    with pytest.raises(DataError, match="trained on each of the 2 files that are to be tested"):
+        leave_out_trained(unstated[:2], every[:2], hashes[:2], trained, "second", source)
+    copies = [hashes[0], hashes[1], hashes[0], hashes[3]]  # within the folder of the training
+    chosen, remarks = leave_out_trained(unstated, splits, copies, None, "first", source)
+    assert chosen.tolist() == splits.tolist() and "1 of the 2 test files" in remarks[0]
+
+
+def test_files_with_the_same_content_have_the_same_hash(tmp_path: Path) -> None:
+    size = READ_WHOLE + 1
+    contents = [b"", b"a", bytes(size), bytes(size - 1), bytes(size - 1) + b"a", b"a" + bytes(size - 1)]
+    files = [tmp_path / f"{number}" for number in range(len(contents))]
+    for file, content in zip(files, contents, strict=True):
+        file.write_bytes(content)
+    hashes = hash_contents(files)
+    assert len(set(hashes)) == len(files) and {len(one) for one in hashes} == {DIGITS}
+    files[0].write_bytes(contents[2])
+    assert hash_contents([files[0], tmp_path / "none", tmp_path]) == [hashes[2], "", ""]
 
 
 @pytest.mark.parametrize("name", SOURCES)
@@ -89,6 +161,9 @@ def test_all_files_are_tested_only_by_a_model_that_was_trained_on_others(name: s
     assert sizes(again) == sizes(trained) and again.fingerprint() == trained.fingerprint()
     with pytest.raises(DataError, match=r"[Ss]tored state of \w+ must hold"):
         again.load_state_dict({"content": 3, "columns": []})
+    if name != "tabular":
+        with pytest.raises(DataError, match=r"[Ss]tored state of \w+ must hold"):
+            again.load_state_dict({**trained.state_dict(), "files": "abc"})
 
 
 @pytest.mark.parametrize("name", ["image_folder", "turned_images", "point_cloud_folder"])
@@ -108,6 +183,7 @@ def test_a_folder_of_test_files_suffices_for_a_trained_model(name: str, tmp_path
     data = for_model(trained, name, settings)
     data.prepare()
     assert sizes(data)[:2] == [0, 0] and sizes(data)[2] == sum(1 for file in root.rglob("*.*"))
+    assert any("test files have the content of files for training or validation" in x for x in data.remarks)
     assert data.target.names == trained.target.names
     if data.target.kind == "class":  # the files of the second class keep its number
         assert {int(data.splits().test[index]["target"]) for index in range(sizes(data)[2])} == {1}

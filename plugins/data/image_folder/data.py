@@ -62,7 +62,7 @@ class LabelledData(Data):
         self.title = find_folder(self.root).resolve().name
         self.skipped, self.remarks = loaded.skipped, loaded.remarks
         self._digest = loaded.digest
-        self._own = Trained(loaded.content, loaded.classes if self.predicts_classes else ())
+        self._own = loaded.own if self.predicts_classes else loaded.own._replace(classes=())
         self._sizes = {split: str(len(table)) for split, table in loaded.splits.items()}
 
     def state_dict(self) -> Mapping[str, Any]:

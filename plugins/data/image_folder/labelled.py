@@ -28,8 +28,11 @@ from framework.datasets.new_files import (
     Trained,
     are_all_for_test,
     describe_tested_share,
+    hash_array,
+    hash_contents,
     hash_files,
     index_labels,
+    leave_out_trained,
 )
 from framework.datasets.shares import check_shares, choose_splits
 from framework.errors import DataError, did_you_mean, quote, shorten
@@ -72,7 +75,7 @@ class Loaded(NamedTuple):
         skipped: Number of images that cannot be read.
         remarks: Clauses about files and columns that are not read.
         digest: Hash of names, classes, splits and, for idx files, pixels.
-        content: Hash of the images, whatever their splits (`framework.datasets.new_files`).
+        own: What a model that is trained on the images stores about them.
     """
 
     classes: tuple[str, ...]
@@ -80,7 +83,7 @@ class Loaded(NamedTuple):
     skipped: int
     remarks: tuple[str, ...]
     digest: str
-    content: str
+    own: Trained
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,7 +200,9 @@ class LabelledImages:
             splits = np.full(len(labels), "test")
         else:
             splits = choose_splits(listed.splits, labels, self.validation, self.test, random)
-        remarks = describe_tested_share(listed.splits, splits, trained, content, root)
+        hashes = _hash_each(root, listed)
+        splits, left_out = leave_out_trained(listed.splits, splits, hashes, trained, content, root)
+        remarks = (*describe_tested_share(listed.splits, splits, trained, content, root), *left_out)
         indices = {split: np.flatnonzero(splits == split) for split in SPLITS}
         self._check_splits(root, classes, labels, indices, trained)
         fields = {
@@ -224,7 +229,8 @@ class LabelledImages:
                 tables[split] = Fields(input=squares, **fields[split], index=torch.arange(len(chosen)))
                 digest.update(squares.numpy().tobytes())
         digest.update(repr((listed.names, listed.labels, splits.tolist())).encode())
-        return Loaded(classes, tables, skipped, (*listed.remarks, *remarks), digest.hexdigest(), content)
+        own = Trained.on(content, classes, hashes, splits)
+        return Loaded(classes, tables, skipped, (*listed.remarks, *remarks), digest.hexdigest(), own)
 
     @staticmethod
     def _check_splits(
@@ -266,6 +272,13 @@ def _hash(root: Path, listed: Listed) -> str:
     for pixels in listed.pixels:
         digest.update(pixels.tobytes())
     return digest.hexdigest()
+
+
+def _hash_each(root: Path, listed: Listed) -> list[str]:
+    """Return a hash of each image, whatever its name and label."""
+    if listed.pixels is None:
+        return hash_contents(root / name for name in listed.names)
+    return [hash_array(pixels) for pixels in listed.pixels]
 
 
 def find_folder(root: str | None) -> Path:

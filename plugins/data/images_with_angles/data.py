@@ -17,10 +17,13 @@ from framework.datasets.csv_columns import Writing
 from framework.datasets.file_columns import SPLITS
 from framework.datasets.images import Crop
 from framework.datasets.new_files import (
+    LEFT_OUT,
     Trained,
     are_all_for_test,
     describe_tested_share,
+    hash_contents,
     hash_files,
+    leave_out_trained,
     restore_trained,
 )
 from framework.errors import DataError, did_you_mean
@@ -115,15 +118,22 @@ class ImagesWithAngles(Data):
                 )
 
     def _choose_test_rows(self, root: Path, table: Table) -> Table:
-        """Return the table with all rows in the test split if `test` is 1, and note its content."""
+        """Return the table with the rows that are used, and note its content.
+
+        If `test` is 1, all rows are in the test split. Test rows of a further folder whose images the model was trained
+        on are left out.
+        """
         content = hash_files(root, [row.file for row in table.rows], [row.angles for row in table.rows])
-        self._own = Trained(content)
         chosen = np.array([row.split for row in table.rows])
         stated = chosen if table.states_splits else np.full(len(chosen), "")
         if are_all_for_test(stated, float(self.test or 0), self._trained, content, root):
-            return table._replace(rows=[row._replace(split="test") for row in table.rows])
-        self.remarks += describe_tested_share(stated, chosen, self._trained, content, root)
-        return table
+            chosen = np.full(len(chosen), "test")
+        hashes = hash_contents(root / row.file for row in table.rows)
+        splits, left_out = leave_out_trained(stated, chosen, hashes, self._trained, content, root)
+        self._own = Trained.on(content, (), hashes, splits)
+        self.remarks += (*describe_tested_share(stated, splits, self._trained, content, root), *left_out)
+        pairs = zip(table.rows, splits.tolist(), strict=True)
+        return table._replace(rows=[row._replace(split=split) for row, split in pairs if split != LEFT_OUT])
 
     def state_dict(self) -> Mapping[str, Any]:
         return (self._trained or self._own).state()

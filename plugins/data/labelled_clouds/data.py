@@ -11,12 +11,14 @@ from pydantic import Field
 
 from framework.configuration.paths import FilePath, Words
 from framework.datasets.class_folders import describe_layouts, list_files
+from framework.datasets.class_names import compare_classes
 from framework.datasets.new_files import (
     TestShare,
     Trained,
     are_all_for_test,
     describe_tested_share,
     index_labels,
+    leave_out_trained,
     restore_trained,
 )
 from framework.datasets.shares import assign_folds, check_shares, choose_splits, hold_out
@@ -96,6 +98,14 @@ class ModelNet40(LabelledClouds):
         self.unreadable: Unreadable = unreadable
         self.validation_share = validation_share
         self.rotations = rotations
+        self._trained: Trained | None = None
+        self._own = Trained()
+
+    def state_dict(self) -> Mapping[str, Any]:
+        return (self._trained or self._own).state()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self._trained = restore_trained(state, type(self).__name__)
 
     def load_clouds(self) -> CloudSet:
         if self.root is None:
@@ -103,11 +113,20 @@ class ModelNet40(LabelledClouds):
             remedy = {"remedy": f"Delete {root}; the models are then generated again."}
         else:
             root, name, remedy = Path(self.root).expanduser(), self.root, {}
-        listed = folders.list_official(root, self.classes)
+        trained = self._trained
+        listed = folders.list_official(root, self.classes, test_only=trained is not None)
         reading = replace(self.reading, surface=True)
-        readable, packed = load_listed(listed, root, reading, "modelnet40/clouds", self.unreadable, **remedy)
+        readable, packed, hashes = load_listed(
+            listed, root, reading, "modelnet40/clouds", self.unreadable, **remedy
+        )
+        names = [spell_name(readable.classes[label]) for label in readable.labels]
+        classes, labels = index_labels(names, trained, root)
+        stated = readable.splits.copy()
         random = stream(self.reading.seed, "validation")
         hold_out(readable.splits, readable.labels, self.validation_share, random)
+        content = packed.digest()
+        splits, known = leave_out_trained(stated, readable.splits, hashes, trained, content, root)
+        self._own = Trained.on(content, classes, hashes, splits)
         synthetic = read_mark(root) is not None
         return CloudSet(
             source=str(root),
@@ -117,15 +136,17 @@ class ModelNet40(LabelledClouds):
                 "rotations": str(self.rotations),
                 "points": f"{self.reading.points}, seed {self.reading.seed}",
             },
-            classes=tuple(map(spell_name, readable.classes)),
+            classes=classes,
             packed=packed,
-            labels=readable.labels,
+            labels=labels,
             names=[file.name for file in readable.files],
-            splits=readable.splits,
+            splits=splits,
             skipped=len(listed.files) - len(readable.files),
             synthetic=synthetic,
             validated_on="validation" if self.validation_share else "train",
             rotations=self.rotations,
+            remarks=known,
+            needed=("train", "validation", "test") if trained is None else ("test",),
         )
 
 
@@ -189,7 +210,9 @@ class PointCloudFolder(LabelledClouds):
         self.title = root.resolve().name
         trained = self._trained
         listed = list_files(root, READERS, 2 if trained is None else 1, test_only=trained is not None)
-        readable, packed = load_listed(listed, root, self.reading, "point_cloud_folder", self.unreadable)
+        readable, packed, hashes = load_listed(
+            listed, root, self.reading, "point_cloud_folder", self.unreadable
+        )
         content = packed.digest()
         names = [spell_name(readable.classes[label]) for label in readable.labels]
         classes, labels = index_labels(names, trained, root)
@@ -198,13 +221,14 @@ class PointCloudFolder(LabelledClouds):
         else:
             random = stream(self.reading.seed, "splits")
             splits = choose_splits(readable.splits, labels, *self.shares, random)
+        splits, left_out = leave_out_trained(readable.splits, splits, hashes, trained, content, root)
         missing = set(range(len(classes))) - set(labels[splits == "train"].tolist())
         if missing and "train" in splits and trained is None:
             raise DataError(
                 f"{root}: The class {classes[min(missing)]} has no training sample, but every class needs one. Add "
                 "files."
             )
-        self._own = Trained(content, classes)
+        self._own = Trained.on(content, classes, hashes, splits)
         return CloudSet(
             source=str(root),
             description={
@@ -222,8 +246,10 @@ class PointCloudFolder(LabelledClouds):
             skipped=len(listed.files) - len(readable.files),
             validated_on="validation" if self.shares[0] or "validation" in splits else "train",
             remarks=(
+                *compare_classes(readable.classes, f"data.root = {root}"),
                 *describe_unread(readable, self.reading),
                 *describe_tested_share(readable.splits, splits, trained, content, root),
+                *left_out,
             ),
             needed=("train", "validation", "test") if trained is None else ("test",),
         )

@@ -119,8 +119,8 @@ def load_listed(
     cache_folder: str,
     unreadable: Unreadable,
     remedy: str | None = None,
-) -> tuple[FileList, Packed]:
-    """Return the list of the files that could be read, and their clouds.
+) -> tuple[FileList, Packed, tuple[str, ...]]:
+    """Return the list of the files that could be read, their clouds, and a hash of the content of each file.
 
     Args:
         listed: The files.
@@ -138,7 +138,7 @@ def load_listed(
         total = len(listed.files)
         advice = remedy or images.advise_unreadable(loaded.faults, total, "data.unreadable=skip")
         raise DataError(images.fault_message(loaded.faults, total, advice))
-    return listed.select(loaded.good), loaded.packed
+    return listed.select(loaded.good), loaded.packed, loaded.hashes
 
 
 def describe_unread(listed: FileList, reading: Reading) -> tuple[str, ...]:

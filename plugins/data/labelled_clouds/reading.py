@@ -20,6 +20,7 @@ from torch.utils.data import Dataset
 
 from framework.datasets import images
 from framework.datasets.fields import Fields
+from framework.datasets.new_files import DIGITS, hash_contents
 from framework.errors import DataError
 from framework.geometry import meshes
 from framework.geometry.clouds import pad
@@ -31,8 +32,8 @@ from framework.storage.names import as_bytes
 from framework.storage.progress import track_progress
 from framework.storage.reading import read_bytes, translate_errors
 
-VERSION = 1
-"""Version of `read_cloud`; increase it if the clouds change, so that cached clouds are not used any more."""
+VERSION = 2
+"""Version of the cached clouds; increase it if `read_cloud` or their file changes, so that old files are not used."""
 SURFACE_POINTS = 2048
 """Number of points drawn from a mesh if no number is given (thesis §6.5.1)."""
 MAX_ROUNDING = 1e-3
@@ -89,11 +90,19 @@ class Packed(NamedTuple):
 
 
 class Loaded(NamedTuple):
-    """Clouds of the files that could be read, indices of these files, and errors of the other files."""
+    """Clouds of the files that could be read.
+
+    Attributes:
+        packed: The clouds.
+        good: Indices of these files.
+        faults: Errors of the other files.
+        hashes: Hash of the content of each of these files (`framework.datasets.new_files`).
+    """
 
     packed: Packed
     good: tuple[int, ...]
     faults: tuple[DataError, ...]
+    hashes: tuple[str, ...]
 
 
 class Clouds(Dataset[dict[str, Tensor]]):
@@ -201,19 +210,23 @@ def load_files(files: Sequence[Path], root: Path, reading: Reading, cache_folder
             arrays = read_npz(read_bytes(cache_file))
             packed = Packed(torch.from_numpy(arrays["points"]), torch.from_numpy(arrays["offset"]))
             faults = {int(number): text for number, text in json.loads(str(arrays["faults"])).items()}
+            hashes = arrays["hashes"].tolist()
     except DataError:  # the cached file is missing or damaged: read the files again
         packed, faults = _read_all(files, reading)
+        hashes = hash_contents(files)
         try:
             with replacing(cache_file) as part, part.open("wb") as stream:
                 points, offset = packed.points.numpy(), packed.offset.numpy()
-                np.savez(stream, points=points, offset=offset, faults=np.array(json.dumps(faults)))
+                texts, digests = np.array(json.dumps(faults)), np.array(hashes, f"<U{DIGITS}")
+                np.savez(stream, points=points, offset=offset, faults=texts, hashes=digests)
         except OSError as error:
             raise DataError(
                 f"{cache_file} cannot be written ({error}). Free space on that disk, or set FRAMEWORK_CACHE to another "
                 "folder."
             ) from error
     good = tuple(number for number in range(len(files)) if number not in faults)
-    return Loaded(packed, good, tuple(map(DataError, faults.values())))
+    of_good = tuple(hashes[number] for number in good)
+    return Loaded(packed, good, tuple(map(DataError, faults.values())), of_good)
 
 
 def _key(files: Sequence[Path], root: Path, reading: Reading) -> str:

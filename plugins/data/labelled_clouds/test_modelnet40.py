@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from framework.configuration.schema import build, resolve
 from framework.errors import DataError
 from framework.geometry.meshes import READERS, read, sample, stream
 from framework.geometry.solids import box
@@ -145,3 +146,22 @@ def test_without_a_root_every_class_is_generated(prepare_data):
     assert len(clouds.target.names) == len(CLASSES) == 40
     assert clouds.fingerprint()["root"] == "synthetic, seed 0"
     assert torch.bincount(clouds.splits().test.fields.fields["target"]).tolist() == [2] * len(CLASSES)
+
+
+def test_a_trained_model_is_tested_on_new_files_of_some_of_its_classes(prepare_data, tmp_path):
+    settings = {"points": 64, "validation_share": 0.2, "classes": ["box", "crate", "cube"]}
+    trained = prepare_data(root=write_official(tmp_path / "ModelNet40"), **settings)
+    assert any(
+        "6 of the 6 test files have the content" in x for x in trained.remarks
+    )  # all are the same cube
+    other = tmp_path / "new"
+    (other / "cube" / "test").mkdir(parents=True)
+    (other / "cube" / "test" / "long.off").write_text(as_off(box(1.0, 2.0, 5.0)))
+    with pytest.raises(DataError, match="the folder cube has no folders train and test"):
+        prepare_data(root=other, **settings)
+    data = build("data", resolve("data", {"name": "modelnet40", "root": str(other), **settings}))
+    data.load_state_dict(trained.state_dict())
+    data.prepare()
+    assert data.target == trained.target and data.remarks == ()
+    assert [len(part) for part in data.splits()] == [0, 0, 1]
+    assert int(data.splits().test[0]["target"]) == 2

@@ -9,6 +9,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int
+from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
@@ -16,8 +17,19 @@ from torch.utils.data import Dataset
 from framework.configuration.paths import FilePath, Words
 from framework.data import Batch, Data, Splits
 from framework.datasets import images
+from framework.datasets.class_names import compare_classes
 from framework.datasets.cloud_picture import draw_cloud
 from framework.datasets.fields import FetchedInBatches
+from framework.datasets.new_files import (
+    TestShare,
+    Trained,
+    are_all_for_test,
+    describe_tested_share,
+    hash_contents,
+    hash_files,
+    leave_out_trained,
+    restore_trained,
+)
 from framework.errors import DataError
 from framework.geometry.meshes import stream
 from framework.storage.names import as_bytes, spell_name
@@ -36,15 +48,16 @@ from plugins.data.labelled_points.features import (
 from plugins.data.labelled_points.scans import (
     LAYOUT,
     SUFFIXES,
+    Classes,
     LabelledScan,
     choose_classes,
+    divide_scans,
     list_scans,
     read_labelled,
     read_points,
 )
 
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
-Share = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)]
 
 
 class Scaling(NamedTuple):
@@ -67,8 +80,9 @@ class Scaling(NamedTuple):
 
     def code(self, scans: Sequence[Scan]) -> Float32[Tensor, "scans basis"]:
         """Return the standardised distances from the basis points to each scan."""
-        codes = np.stack([scan_code(scan, self.bases) for scan in scans])
-        start = len(self.location) - codes.shape[1]
+        length = len(self.bases.whole)
+        codes = np.array([scan_code(scan, self.bases) for scan in scans]).reshape(len(scans), length)
+        start = len(self.location) - length
         return torch.from_numpy(((codes - self.location[start:]) / self.scale[start:]).astype(np.float32))
 
 
@@ -95,9 +109,10 @@ class Points(FetchedInBatches):
         stored: bool = False,
     ) -> None:
         self.scans, self.features, self.scaling = scans, features, scaling
-        self.row = np.concatenate(rows)
+        nothing = np.zeros(0, np.int64)
+        self.row = np.concatenate([nothing, *rows])
         self.scan = np.repeat(np.arange(len(scans)), [len(part) for part in rows])
-        self.label = None if labels is None else torch.from_numpy(np.concatenate(labels))
+        self.label = None if labels is None else torch.from_numpy(np.concatenate([nothing, *labels]))
         self.code = scaling.code(scans)
         self.local = self._local(np.arange(len(self.row))) if stored else None
 
@@ -133,6 +148,8 @@ class _Prepared(NamedTuple):
     splits: Splits
     fingerprint: dict[str, str]
     remarks: tuple[str, ...]
+    own: Trained
+    labels: Int[np.ndarray, "classes"]
 
 
 class LabelledPoints(Data):
@@ -152,7 +169,8 @@ class LabelledPoints(Data):
         features: Settings of the features.
         validation: Share of the scans for validation, if there are no folders of splits; at least one scan. With 0,
             the training points are also used for validation.
-        test: Share of the scans for the test, if there are no folders of splits; at least one scan.
+        test: Share of the scans for the test, if there are no folders of splits; at least one scan. 1 makes all scans
+            test scans, for a model that was trained on other scans.
         data_seed: Seed of points, basis points and splits, independent of the seed of the run.
     """
 
@@ -173,7 +191,7 @@ class LabelledPoints(Data):
         points: Annotated[int, Field(ge=1, le=100_000_000)] = 2048,
         features: Features,
         validation: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.15,
-        test: Share = 0.15,
+        test: TestShare = 0.15,
         data_seed: Seed = 0,
     ) -> None:
         self.root, self.label, self.points = root, label, points
@@ -184,6 +202,8 @@ class LabelledPoints(Data):
         self.data_seed = data_seed
         self.columns = features.names
         self._trained: Scaling | None = None
+        self._trained_on: Trained | None = None
+        self._trained_labels: NDArray | None = None
 
     def prepare(self) -> None:
         prepared = self._prepared
@@ -197,27 +217,31 @@ class LabelledPoints(Data):
         if self.root is None:
             raise DataError(f"data.root is not set. {LAYOUT}")
         root, seed = Path(self.root).expanduser(), self.data_seed
-        listed = list_scans(root, *self.shares, stream(seed, "splits"))
-        files, splits = listed.files, listed.splits
+        is_trained = self._trained is not None
+        listed = list_scans(root, test_only=is_trained)
+        files = listed.files
+        paths = [file.relative_to(root).as_posix() for file in files]
+        content = hash_files(root, paths, [""] * len(files))
+        if are_all_for_test(listed.splits, self.shares[1], self._seen_files, content, root):
+            splits = np.full(len(files), "test")
+        else:
+            splits = divide_scans(listed, root, *self.shares, stream(seed, "splits"))
+        hashes = hash_contents(files)
+        splits, left_out = leave_out_trained(listed.splits, splits, hashes, self._seen_files, content, root)
         labelled = self._read_all(files)
         validated_on = "validation" if self.shares[0] or "validation" in splits else "train"
         numbers = {
             name: np.flatnonzero(splits == (validated_on if name == "validation" else name))
             for name in Splits._fields
         }
-        names, labels = choose_classes(
-            [scan for scan, _ in labelled],
-            [str(file) for file in files],
-            numbers["train"].tolist(),
-            self.classes,
-            self.unlabelled,
-        )
+        classes = self._classes_of([scan for scan, _ in labelled], files, numbers["train"])
+        names, labels = classes
         chosen = {
             name: [self._choose(labelled[i][0], files[i], labels, every=name == "test") for i in part]
             for name, part in numbers.items()
         }
         for name, rows in chosen.items():
-            if not sum(map(len, rows)):
+            if not sum(map(len, rows)) and (name == "test" or not is_trained):
                 raise DataError(
                     f"{root}: no point of the {name} split has a class, because data.unlabelled = "
                     f"{list(self.unlabelled)} names all their labels. Add scans, or correct data.unlabelled."
@@ -253,11 +277,39 @@ class LabelledPoints(Data):
             **{name: f"{len(datasets[name])} points of {len(scans[name])} scans" for name in Splits._fields},
             "sha256": digest.hexdigest(),
         }
-        remarks = [f"left out: {listed.ignored} files of other kinds"] if listed.ignored else []
+        remarks = [
+            *compare_classes(names, f"data.classes = {list(names)}"),
+            *describe_tested_share(listed.splits, splits, self._seen_files, content, root),
+            *left_out,
+        ]
+        if listed.ignored:
+            remarks.append(f"left out: {listed.ignored} files of other kinds")
         without = sum(int(np.isin(scan.labels, self.unlabelled).sum()) for scan, _ in labelled)
         if without:
             remarks.append(f"left out: {without} points without a class, which are only neighbours")
-        return _Prepared(names, scaling, Splits(**datasets), fingerprint, tuple(remarks))
+        own = Trained.on(content, names, hashes, splits)
+        return _Prepared(names, scaling, Splits(**datasets), fingerprint, tuple(remarks), own, labels)
+
+    @property
+    def _seen_files(self) -> Trained | None:
+        """Return what a trained model stores about its scans; None without a trained model."""
+        return None if self._trained is None else self._trained_on or Trained()
+
+    def _classes_of(
+        self, scans: Sequence[LabelledScan], files: Sequence[Path], training: Int[np.ndarray, "scans"]
+    ) -> Classes:
+        """Return the classes of the trained model or, without one, those of the scans with the indices `training`."""
+        sources = [str(file) for file in files]
+        if self._trained_on is None or self._trained_labels is None:
+            if not len(training):
+                raise DataError(
+                    f"{self.root} holds no scans for training, from which the classes could be read, and an older "
+                    "version stored the model without its classes. Train the model again."
+                )
+            return choose_classes(scans, sources, training.tolist(), self.classes, self.unlabelled)
+        classes = Classes(self._trained_on.classes, self._trained_labels)
+        classes.require_known(scans, sources, self.unlabelled)
+        return classes
 
     def _read_all(self, files: Sequence[Path]) -> list[tuple[LabelledScan, Scan]]:
         """Return the labelled points of each file, and the scan that finds their neighbours."""
@@ -286,7 +338,9 @@ class LabelledPoints(Data):
         if self.root is None:
             raise DataError(f"data.root is not set. {LAYOUT}")
         root = Path(self.root).expanduser()
-        listed = list_scans(root, *self.shares, stream(self.data_seed, "splits"))
+        listed = list_scans(root, test_only=self._trained is not None)
+        if self.shares[1] < 1:
+            divide_scans(listed, root, *self.shares, stream(self.data_seed, "splits"))
         read_labelled(listed.files[0], self.label)
 
     def splits(self) -> Splits:
@@ -316,7 +370,14 @@ class LabelledPoints(Data):
     def state_dict(self) -> Mapping[str, Any]:
         bases, location, scale = self._scaling
         parts = {"around": bases.around, "whole": bases.whole, "location": location, "scale": scale}
-        return {name: torch.from_numpy(part.copy()) for name, part in parts.items()}
+        state: dict[str, Any] = {name: torch.from_numpy(part.copy()) for name, part in parts.items()}
+        if self._trained is None:
+            files, labels = self._prepared.own, self._prepared.labels
+        else:  # a model that an older version stored has neither
+            files, labels = self._trained_on, self._trained_labels
+        if files is not None and labels is not None:
+            state |= {**files.state(), "labels": labels.tolist()}
+        return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         if not state:
@@ -343,6 +404,18 @@ class LabelledPoints(Data):
                 "The stored state of labelled_points holds a scale that is not above 0. Load another checkpoint, or "
                 "train the model again."
             )
+        files = restore_trained(
+            {name: state[name] for name in Trained._fields if name in state}, "labelled_points"
+        )
+        labels = state.get("labels", [])
+        are_labels = isinstance(labels, list) and all(isinstance(label, int) for label in labels)
+        if not are_labels or len(labels) != len(files.classes) or sorted(set(labels)) != labels:
+            raise DataError(
+                "The stored state of labelled_points must hold one label for each class, in ascending order, but holds "
+                "something else. Load another checkpoint, or train the model again."
+            )
+        self._trained_on = files if labels else None
+        self._trained_labels = np.array(labels, np.int64) if labels else None
         self._trained = Scaling(Bases(parts["around"], parts["whole"]), parts["location"], parts["scale"])
         vars(self).pop("_prepared", None)
 

@@ -31,25 +31,29 @@ class LabelledScan(NamedTuple):
 
 
 class ScanFiles(NamedTuple):
-    """Files of scans with the split of each, and the number of files of other kinds."""
+    """Files of scans with the split of each, "" if none is stated, and the number of files of other kinds."""
 
     files: list[Path]
     splits: NDArray
     ignored: int
 
 
-def list_scans(root: Path, validation: float, test: float, random: np.random.Generator) -> ScanFiles:
-    """Return the scans of a folder with their splits.
+def list_scans(root: Path, *, test_only: bool = False) -> ScanFiles:
+    """Return the scans of a folder, with the splits that its folders state.
 
-    Without folders of splits, whole scans are drawn for validation and test: at least one for each share above 0.
+    Args:
+        root: The folder.
+        test_only: Whether scans of the test split suffice, because the model is trained already.
 
     Raises:
-        DataError: The folder is missing or has another layout, or there are too few scans for the splits.
+        DataError: The folder is missing or has another layout.
     """
     folders = [path for path in subfolders(root, LAYOUT) if path.name in SPLITS]
     if folders:
         names = {path.name for path in folders}
-        missing = [name for name in ("train", "test") if name not in names]
+        missing = [
+            name for name in ("train", "test") if name not in names and not (test_only and name == "train")
+        ]
         if missing:
             raise DataError(
                 f"data.root = {root} holds a folder {folders[0].name}, but no folder {missing[0]}. {LAYOUT}"
@@ -68,24 +72,68 @@ def list_scans(root: Path, validation: float, test: float, random: np.random.Gen
     for folder in folders:
         if folder.name not in split_names:
             raise DataError(f"{folder} holds no scan. {LAYOUT}")
-    if not folders:
+    if not files:
+        raise DataError(f"data.root = {root} holds no scan. {LAYOUT}")
+    return ScanFiles(files, split_names, len(visible) - len(scans))
+
+
+def divide_scans(
+    listed: ScanFiles, root: Path, validation: float, test: float, random: np.random.Generator
+) -> NDArray:
+    """Return the split of each scan.
+
+    Without folders of splits, whole scans are drawn for validation and test: at least one for each share above 0.
+
+    Raises:
+        DataError: There are too few scans for the splits.
+    """
+    count = len(listed.files)
+    if "" in listed.splits:
         needed = 2 + (validation > 0)
-        if len(files) < needed:
+        if count < needed:
             raise DataError(
-                f"data.root = {root} holds {len(files)} scans, but at least {needed} are needed: whole scans are drawn "
+                f"data.root = {root} holds {count} scans, but at least {needed} are needed: whole scans are drawn "
                 f"for training, {'validation ' if validation else ''}and test. {LAYOUT}"
             )
         check_shares(validation, test)
-        validation, test = (share and max(share, 1 / len(files)) for share in (validation, test))
-        if validation + test > 1 - 1 / len(files) + 1e-9:
+        validation, test = (share and max(share, 1 / count) for share in (validation, test))
+        if validation + test > 1 - 1 / count + 1e-9:
             raise DataError(
-                f"data.validation and data.test leave none of the {len(files)} scans of {root} for training. Reduce "
+                f"data.validation and data.test leave none of the {count} scans of {root} for training. Reduce "
                 "one of them."
             )
-    one_class = np.zeros(len(files), np.int64)
-    return ScanFiles(
-        files, choose_splits(split_names, one_class, validation, test, random), len(visible) - len(scans)
-    )
+    return choose_splits(listed.splits, np.zeros(count, np.int64), validation, test, random)
+
+
+class Classes(NamedTuple):
+    """Names of the classes, and the label of each, ascending."""
+
+    names: tuple[str, ...]
+    labels: Int[np.ndarray, "classes"]
+
+    def require_known(
+        self, scans: Sequence[LabelledScan], sources: Sequence[str], unlabelled: Sequence[int]
+    ) -> None:
+        """Refuse a label that no class of a trained model has.
+
+        Args:
+            scans: The scans.
+            sources: Name of each scan for the message.
+            unlabelled: Labels that are no class.
+
+        Raises:
+            DataError: A point has such a label.
+        """
+        for source, scan in zip(sources, scans, strict=True):
+            unknown = np.setdiff1d(scan.labels, [*unlabelled, *self.labels])
+            if len(unknown):
+                known = ", ".join(
+                    f"{label} ({name})" for name, label in zip(self.names, self.labels, strict=True)
+                )
+                raise DataError(
+                    f"{source}: a point has the label {unknown[0]}, but the model knows the labels {shorten(known)}. "
+                    "Correct the label, or list it in data.unlabelled."
+                )
 
 
 def read_points(file: Path) -> Float[np.ndarray, "points 3"]:
@@ -140,8 +188,8 @@ def choose_classes(
     training: Sequence[int],
     names: Sequence[str] | None,
     unlabelled: Sequence[int],
-) -> tuple[tuple[str, ...], Int[np.ndarray, "classes"]]:
-    """Return the names of the classes, and the label of each.
+) -> Classes:
+    """Return the classes of scans for a training.
 
     Args:
         scans: All scans.
@@ -182,4 +230,4 @@ def choose_classes(
             "every class needs one. Add scans, leave the class out of data.classes, or list its label in "
             "data.unlabelled."
         )
-    return tuple(names_of.values()), labels
+    return Classes(tuple(names_of.values()), labels)

@@ -63,6 +63,50 @@ def test_files_of_a_trained_model_get_the_features_of_the_test(scans, tmp_path):
         )
 
 
+def for_model(trained, root, **config):
+    data = build("data", resolve("data", {"name": "labelled_points", "root": str(root), **config}))
+    data.load_state_dict(trained.state_dict())
+    return data
+
+
+def test_a_trained_model_is_tested_on_scans_with_some_of_its_classes(scans, tmp_path):
+    trained = prepare(scans)
+    other = tmp_path / "other"
+    other.mkdir()
+    points, labels = scan(9)
+    save(other / "wall.npz", points[labels == 6], label=labels[labels == 6])
+    data = for_model(trained, other, test=1)
+    data.prepare()
+    assert [len(part) for part in data.splits()] == [0, 0, 20]
+    assert data.target == trained.target
+    assert set(fetch(data.splits().test, range(20))["target"].tolist()) == {1}  # label 6 is the second class
+    (other / "test").mkdir()
+    (other / "wall.npz").rename(other / "test" / "wall.npz")
+    stated = for_model(trained, other)  # a folder of test scans suffices
+    stated.prepare()
+    assert stated.fingerprint()["test"] == "20 points of 1 scans"
+    save(other / "test" / "tree.npz", points, label=np.full(60, 8))
+    with pytest.raises(DataError, match=r"tree.npz: a point has the label 8, .* knows the labels 2 \(2\), 6"):
+        for_model(trained, other).prepare()
+
+
+def test_a_model_of_an_older_version_needs_training_scans(scans, tmp_path):
+    state = {
+        name: part
+        for name, part in prepare(scans).state_dict().items()
+        if name in ("around", "whole", "location", "scale")
+    }
+    other = tmp_path / "other"
+    other.mkdir()
+    write_scan(other / "further.ply", 9)
+    data = build("data", resolve("data", {"name": "labelled_points", "root": str(other), "test": 1}))
+    data.load_state_dict(state)
+    with pytest.raises(DataError, match="an older version stored the model without its classes"):
+        data.prepare()
+    with pytest.raises(DataError, match="must hold one label for each class"):
+        data.load_state_dict({**prepare(scans).state_dict(), "labels": [2]})
+
+
 def test_points_without_a_class_are_only_neighbours(scans):
     points, labels = scan(7)
     labels[:10] = -1
