@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shlex
+import statistics
 import subprocess
 import sys
 from pathlib import Path
@@ -25,6 +26,7 @@ from framework.configuration.composition import (
     register,
 )
 from framework.configuration.config import Config
+from framework.configuration.registry import installed, load
 from framework.configuration.settings import (
     PRECISIONS,
     STRATEGIES,
@@ -172,6 +174,21 @@ def test_an_experiment_of_each_family_can_be_shortened(name: str) -> None:
         assert 1 <= trainer["check_val_every_n_epoch"] <= epochs
 
 
+@pytest.mark.parametrize(
+    "name", sorted(name for name in installed("density_head") if load("density_head", name).knobs)
+)
+def test_a_density_head_takes_few_samples_or_steps_in_a_short_test(name: str) -> None:
+    """A head whose knob keeps its default may take minutes, for example in the intervals of a mixture of ten models."""
+    ordinary = plain(composed(f"density_head={name}"))["density_head"]
+    short = plain(composed(f"density_head={name}", "debug=fast"))["density_head"]
+    for knob, settings in load("density_head", name).knobs.items():
+        assert short[knob] <= statistics.median(settings) and short[knob] < ordinary[knob]
+    changed = {key for key in ordinary if ordinary[key] != short[key]}
+    assert changed == set(load("density_head", name).knobs)
+    asked = plain(composed(f"density_head={name}", f"density_head.{knob}={ordinary[knob]}", "debug=fast"))
+    assert asked["density_head"][knob] == ordinary[knob]
+
+
 SHORTER = {
     "caviar/": "batch_size=8",
     "faust/": "batch_size=4",
@@ -180,7 +197,6 @@ SHORTER = {
     "modelnet40/bps_conv3d_delta": "encoder.bps.points=4096",
     "modelnet40/bps_conv3d_ensemble": "encoder.bps.points=4096 uncertainty.ensemble.members=2",
     "modelnet40/bps_mlp_grid_32": "encoder.bps.points=512",
-    "modelnet40/bps_xgboost": "density_head.rounds=3",
     "modelnet40/deepsets": "encoder.deepsets.points=128",
     "modelnet40/occ_mlp_32": "encoder.occupancy.side=12",
     "modelnet40/pointnet2": "encoder.pointnet2.width=0.25 encoder.pointnet2.centroids=[64,16]",
@@ -190,9 +206,8 @@ SHORTER = {
     "moons/mc_dropout": "uncertainty.mc_dropout.samples=3",
     "moons/swag": "uncertainty.swag.samples=3",
     "pascal3d": "batch_size=8",
-    "rasterizer/fit_pose": "density_head.steps=1 data.height=64 data.width=48",
+    "rasterizer/fit_pose": "data.height=64 data.width=48",
     "smplpix/unet": "encoder.unet.width=4",
-    "symmetric_solids/implicit_pdf": "density_head.cells=4608",
     "table_tennis/": "batch_size=8",
     "towncentre/": "batch_size=8",
 }
