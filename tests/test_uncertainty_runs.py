@@ -159,6 +159,11 @@ def test_only_models_that_are_alike_are_joined(tmp_path: Path) -> None:
         common_description([described(), described(input_shape=(3,))])
     with pytest.raises(CheckpointError, match="differ in data_state"):
         common_description([described(), described(data_state={"mean": [1.0]})])
+    scales = [{"scale": torch.arange(count)} for count in (2, 2, 3)]
+    alike = [described(data_state=scale) for scale in scales]
+    assert common_description(alike[:2]) is alike[0]
+    with pytest.raises(CheckpointError, match="differ in data_state"):
+        common_description(alike[1:])
     for name in ("10", "9"):
         (tmp_path / name / "checkpoints").mkdir(parents=True)
         (tmp_path / name / "checkpoints" / "model.ckpt").touch()

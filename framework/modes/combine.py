@@ -91,12 +91,23 @@ def common_description(members: Sequence[Description]) -> Description:
                 )
         for key in ("target", "input_shape", "data_state"):
             other_value, first_value = getattr(other, key), getattr(first, key)
-            if other_value != first_value:
+            if not _are_equal(other_value, first_value):
                 raise CheckpointError(
                     f"{other.path} and {first.path} differ in {key}: {str(other_value)[:200]} and "
                     f"{str(first_value)[:200]}. Train the members on the same data."
                 )
     return first
+
+
+def _are_equal(first: Any, second: Any) -> bool:
+    """Return whether two values are equal; the values of a mapping may be tensors, as in the state of a data set."""
+    if isinstance(first, Mapping) and isinstance(second, Mapping):
+        return first.keys() == second.keys() and all(_are_equal(first[key], second[key]) for key in first)
+    if isinstance(first, torch.Tensor) and isinstance(second, torch.Tensor):
+        return torch.equal(first, second)
+    return (
+        not isinstance(first, torch.Tensor) and not isinstance(second, torch.Tensor) and bool(first == second)
+    )
 
 
 def wrapper_config(wrapper: str, count: int) -> dict[str, Any]:
