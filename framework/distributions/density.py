@@ -285,6 +285,32 @@ def _(density: Mixture, index: int) -> Distribution:
     return Mixture(density.log_weights, protocol.marginal(density.components, index))
 
 
+@protocol.even_sample.register
+@torch.no_grad()
+def _(density: Mixture, count: int) -> Tensor:
+    """Return draws of which component k gives w_k `count`, rounded up or down; they are ordered by component.
+
+    The components are chosen at equally spaced places of their cumulative weights, from a random place on (systematic
+    sampling). If the components are mixtures too, their components are chosen in the same way.
+    """
+    components, log_weights = density.components, density.log_weights
+    if log_weights.shape[-1] == 1:
+        return protocol.even_sample(components, count).squeeze(-1 - len(density.event_shape))
+    nested = isinstance(components, Mixture)
+    if nested:
+        log_weights = (log_weights.unsqueeze(-1) + components.log_weights).flatten(-2)
+    cumulative = log_weights.double().exp().cumsum(-1)
+    start = torch.rand((*density.batch_shape, 1), dtype=cumulative.dtype, device=cumulative.device)
+    steps = torch.arange(count, dtype=cumulative.dtype, device=cumulative.device)
+    places = (steps + start) / count * cumulative[..., -1:]
+    which = torch.searchsorted(cumulative, places).clamp(max=cumulative.shape[-1] - 1).movedim(-1, 0)
+    if not nested:
+        return protocol.pick(components, which).sample()
+    mixtures, inner = components.log_weights.shape[-2:]
+    wide = (which % inner).unsqueeze(-1).expand(*which.shape, mixtures)
+    return protocol.pick(protocol.pick(components.components, wide), which // inner).sample()
+
+
 @protocol.median.register
 def _(density: Mixture, samples: int) -> Tensor:
     """Return the median of a mixture.

@@ -57,16 +57,25 @@ def median(density: Distribution, samples: int) -> Tensor:
     """Return the point of least expected absolute deviation, number by number (thesis eq. 3.23), (*batch, *event).
 
     For classes, the default returns the mode, since a label is either right or wrong. For numbers, the default returns
-    the median of `samples` draws (thesis eq. 3.24), which for angles is the circular median. A density whose median is
-    known in closed form registers its own function, which draws nothing. For a mixture of several components over
-    images, the function returns the mean instead.
+    the median of `samples` draws (thesis eq. 3.24, `even_sample`), which for angles is the circular median. A density
+    whose median is known in closed form registers its own function, which draws nothing. For a mixture of several
+    components over images, the function returns the mean instead.
     """
     if density.has_enumerate_support:
         return density.mode
-    draws = density.sample(torch.Size((samples,)))
-    if isinstance(density.support, Circular):
-        return circular_median(draws)
-    return draws.median(0).values
+    draws = even_sample(density, samples)
+    return circular_median(draws) if isinstance(density.support, Circular) else draws.median(0).values
+
+
+@singledispatch
+def even_sample(density: Distribution, count: int) -> Tensor:
+    """Return `count` draws, (count, *batch, *event), for shares of draws, and for means over them, such as the median.
+
+    The default returns independent draws. A density may register a function whose draws together are spread more
+    evenly: shares and means have the same expectations as those of independent draws, and vary less. So chance does not
+    decide which of two opposite peaks of nearly equal probability holds the median of an angle.
+    """
+    return density.sample(torch.Size((count,)))
 
 
 @singledispatch

@@ -18,6 +18,7 @@ from framework.distributions.protocol import (
     QuadraticBound,
     estimate,
     estimate_with_error,
+    even_sample,
     images,
     mode_candidates,
     quadratic_bound,
@@ -299,10 +300,15 @@ class CircularPower(DerivedDensity):
     @torch.no_grad()
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         shape = torch.Size(sample_shape)
-        draws = torch.rand(shape.numel(), *self.batch_shape, dtype=torch.float64, device=self.start.device)
+        shares = torch.rand(shape.numel(), *self.batch_shape, dtype=torch.float64, device=self.start.device)
+        return self.quantiles(shares).reshape(*shape, *self.batch_shape, 1)
+
+    @torch.no_grad()
+    def quantiles(self, shares: Float[Tensor, "number *batch"]) -> Float[Tensor, "number *batch 1"]:
+        """Return the angles up to which the arc from the mode has the probabilities `shares`, float64 in [0, 1)."""
         offset, height = self._between
         until = _cumulative_integral(offset, height)
-        flat = draws.reshape(shape.numel(), len(until)).T.contiguous() * until[:, -1:]
+        flat = shares.reshape(len(shares), len(until)).T.contiguous() * until[:, -1:]
         cell = torch.searchsorted(until, flat, right=True).clamp(1, until.shape[-1] - 1)
         low, high, start, end = (
             column.gather(-1, at) for column in (height, offset) for at in (cell - 1, cell)
@@ -312,8 +318,8 @@ class CircularPower(DerivedDensity):
         width = (end - start).clamp(min=1e-300)
         root = (low.square() + 2 * (high - low) / width * rest).clamp(min=0).sqrt()
         step = (2 * rest / (low + root).clamp(min=1e-300)).clamp(max=width)
-        samples = wrap(self.start.double() + (start + step).T.reshape(*shape, *self.batch_shape, 1))
-        return samples.to(self.start.dtype)
+        angles = wrap(self.start.double() + (start + step).T.reshape(len(shares), *self.batch_shape, 1))
+        return angles.to(self.start.dtype)
 
     @cached_property
     @torch.no_grad()
@@ -365,6 +371,14 @@ def _cumulative_integral(position: Tensor, height: Float[Tensor, "item node"]) -
     """
     cells = position.diff(dim=-1) * (height[:, 1:] + height[:, :-1]) / 2
     return torch.nn.functional.pad(cells.cumsum(-1), (1, 0))
+
+
+@even_sample.register
+def _(density: CircularPower, count: int) -> Tensor:
+    """Return quantiles for equally spaced probabilities, from a random probability on."""
+    start = torch.rand(density.batch_shape, dtype=torch.float64, device=density.start.device)
+    number = torch.arange(count, dtype=torch.float64, device=start.device).reshape(-1, *(1,) * start.dim())
+    return density.quantiles((number + start) / count)
 
 
 @quadratic_bound.register

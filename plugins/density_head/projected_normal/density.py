@@ -11,12 +11,22 @@ from torch.distributions import constraints
 from framework.distributions.circular import circular, grid, wrap
 from framework.distributions.description import PlainDensity
 from framework.distributions.panels import entropy_of_one
-from framework.distributions.protocol import estimate, exact_estimate, marginal, mode_candidates, pick, take
+from framework.distributions.protocol import (
+    estimate,
+    even_sample,
+    exact_estimate,
+    marginal,
+    mode_candidates,
+    pick,
+    take,
+)
 from framework.heads.peak_quadrature import refine
 from plugins.density_head.projected_normal import functions
 
 POINTS = 180
 """Number of angles of the grid on which the search for the mode begins."""
+GOLDEN = (math.sqrt(5) - 1) / 2
+"""Step of the lattice of `even_sample` in its second coordinate."""
 
 
 class ProjectedNormal(PlainDensity):
@@ -55,7 +65,25 @@ class ProjectedNormal(PlainDensity):
     @torch.no_grad()
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         shape = torch.Size(sample_shape) + self.batch_shape + self.event_shape
-        first, second = torch.randn(2, *shape, dtype=torch.float64, device=self.mean_vector.device)
+        return self._directions(*torch.randn(2, *shape, dtype=torch.float64, device=self.mean_vector.device))
+
+    @torch.no_grad()
+    def even_sample(self, count: int) -> Tensor:
+        """Return `count` angles, (count, *batch, angle), whose shares in arcs differ little from the probabilities.
+
+        They are the directions of points of a lattice in the unit square, with a random shift, that the map of Box &
+        Muller 1958 turns into normal vectors.
+        """
+        shape = (*self.batch_shape, *self.event_shape)
+        shift = torch.rand(2, *shape, dtype=torch.float64, device=self.mean_vector.device)
+        number = torch.arange(count, dtype=torch.float64, device=shift.device).reshape(-1, *(1,) * len(shape))
+        share = torch.remainder((number + 0.5) / count + shift[0], 1)
+        turn = 2 * math.pi * torch.remainder(number * GOLDEN + shift[1], 1)
+        length = (-2 * torch.log1p(-share)).sqrt()
+        return self._directions(length * turn.cos(), length * turn.sin())
+
+    def _directions(self, first: Tensor, second: Tensor) -> Tensor:
+        """Return the directions of normal vectors that are computed from independent standard normal numbers."""
         grow, shear = self.factor.double().unbind(-1)
         # L⁻ᵀ z has the covariance (LLᵀ)⁻¹
         second = torch.exp(grow) * second
@@ -101,6 +129,11 @@ class ProjectedNormal(PlainDensity):
 
 
 estimate.register(ProjectedNormal, exact_estimate)
+
+
+@even_sample.register
+def _(density: ProjectedNormal, count: int) -> Tensor:
+    return density.even_sample(count)
 
 
 @marginal.register
