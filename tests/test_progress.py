@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from framework.storage.log_messages import PlainLogRecord
+from framework.storage.log_messages import PlainLogRecord, log_each_message_once
 from framework.storage.progress import QUIET_TIME, REPORT_INTERVAL, PlainConsole, Work, track_progress
 
 
@@ -112,6 +112,19 @@ def test_the_message_of_a_log_steers_no_terminal() -> None:
     record = PlainLogRecord("a", logging.WARNING, "a.py", 1, "weights %s", (STEERING,), None)
     assert record.getMessage().isprintable()
     assert record.getMessage().startswith("weights a\\x1b]52;c;eA==")
+
+
+def test_a_check_writes_each_message_of_a_log_once(caplog: pytest.LogCaptureFixture) -> None:
+    log = logging.getLogger("framework.planted")
+    with log_each_message_once():
+        for _ in range(3):
+            log.warning("the mass of %d densities", 2)
+            log.warning("the mass of %d densities", 3)
+    assert [record.getMessage() for record in caplog.records] == [
+        f"the mass of {n} densities" for n in (2, 3)
+    ]
+    log.warning("the mass of %d densities", 2)
+    assert len(caplog.records) == 3
 
 
 def test_no_other_module_makes_a_console() -> None:

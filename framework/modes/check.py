@@ -18,6 +18,7 @@ from framework.configuration.settings import Settings
 from framework.configuration.signature import untyped
 from framework.errors import ConfigError, UserError
 from framework.reports.table import write_csv
+from framework.storage.log_messages import log_each_message_once
 from framework.storage.progress import PlainConsole
 from framework.testing.contract import CONTRACTS, Contract, Row, contract
 from framework.testing.finding import Finding, describe_error
@@ -106,6 +107,7 @@ def describe_untyped(group: str, name: str) -> str:
     )
 
 
+@log_each_message_once()
 def examine(plugin: Contract, console: Console) -> tuple[Group, list[dict[str, object]], list[str]]:
     """Return a plugin's report (worst case of each tested property), all test results, and the failed properties."""
     start = time.perf_counter()

@@ -57,6 +57,7 @@ from framework.prediction import Prediction, true_image
 from framework.runs.introduction import introduce, introduce_model, introduce_threads
 from framework.runs.job import refuse_idle
 from framework.runs.resuming import find_resumable, may_resume
+from framework.runs.returned import check_parts, require_losses
 from framework.runs.run import Run
 from framework.storage.checkpoints import read, write
 from framework.storage.first_rank import first_rank
@@ -403,10 +404,10 @@ def _add_metrics(session: Session, metrics: "Sequence[Metric]") -> Session:
 def rehearse(session: Session) -> None:
     """Try the steps that follow training with a few samples, so that errors in these steps appear before training.
 
-    The function checks a few targets, lets the untrained model predict two samples, updates every metric with these
-    predictions, and calibrates a copy of the model. A model that is fitted in one step cannot predict before the fit.
-    For such a model, the function only checks the targets, and that the batches have the images that metrics compare
-    with predicted images.
+    The function checks a few targets, lets the untrained model predict two samples, checks what each of its parts
+    returns, updates every metric with these predictions, and calibrates a copy of the model. A model that is fitted in
+    one step cannot predict before the fit. For such a model, the function only checks the targets, and that the batches
+    have the images that metrics compare with predicted images.
 
     Raises:
         UserError: The data, a metric or an uncertainty wrapper fails with these samples.
@@ -425,8 +426,12 @@ def rehearse(session: Session) -> None:
         return
     seed_step(session.settings.seed, 0, "rehearsal")
     training = session.predictor.training
-    with silence():  # before calibration, a wrapper may warn that its results mean nothing
+    # before calibration, a wrapper may warn that its results mean nothing
+    with silence(), check_parts(session.predictor, session.target):
         density = session.predictor.eval()(validation_batch["input"])
+        if learns(session.predictor) and self_training(session.predictor) is None:
+            losses = session.predictor.loss(validation_batch["input"], validation_batch["target"])
+            require_losses(losses, session.predictor, len(validation_batch["input"]))
     session.predictor.train(training)
     samples = session.settings.samples
     predictions = [Prediction(density, validation_batch, samples)]
