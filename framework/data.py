@@ -284,6 +284,13 @@ class Mapped(ABC):
         """
 
 
+def shape_fits(shape: tuple[int, ...], expected: tuple[int, ...]) -> bool:
+    """Return whether an input has the expected shape; a cloud, (points, columns), may have fewer points."""
+    if len(expected) == 2 and len(shape) == 2:
+        return 0 < shape[0] <= expected[0] and shape[1] == expected[1]
+    return shape == expected
+
+
 def as_inputs(user_data: Any, shape: tuple[int, ...]) -> Tensor:
     """Return an array, or an object that NumPy can convert to an array, as a batch of inputs of `shape`.
 

@@ -1,19 +1,23 @@
 """Parts of a model that return something wrong are named, with the line, before the training."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution, Independent, Normal
 
+from framework.data import Data, Splits
 from framework.density_head import DensityHead
 from framework.encoder import Encoder
-from framework.errors import ConfigError
+from framework.errors import ConfigError, DataError
+from framework.evaluation.splits import numbers
+from framework.metric import Metric
 from framework.model import Model, Predictor
-from framework.runs.returned import check_parts, require_losses
+from framework.runs.returned import check_parts, require_inputs, require_losses, require_splits
 from framework.target import Target
 from framework.uncertainty import Uncertainty
 
@@ -126,6 +130,84 @@ def test_the_part_at_fault_is_named(name: str) -> None:
     predictor, message = FAULTS[name]
     with pytest.raises(ConfigError, match=message):
         rehearse(predictor)
+
+
+class Points(Data):
+    bibtex = ""
+    groups = ("points",)
+    synthetic = True
+    target = TARGET
+
+    def __init__(self, input_shape: tuple[int, ...], returned: Any = None) -> None:
+        self.input_shape = input_shape
+        self.returned = returned
+
+    def prepare(self) -> None: ...
+
+    def splits(self) -> Splits:
+        return self.returned
+
+    def read(self, files: Any) -> Any: ...
+
+    def augment(self, batch: Any) -> Any:
+        return batch
+
+    def fingerprint(self) -> dict[str, str]:
+        return {}
+
+    def preview(self, inputs: Tensor) -> Any: ...
+
+
+@pytest.mark.parametrize("stated, given", [((4,), (4,)), ((9, 3), (7, 3)), ((3, 8, 8), (3, 8, 8))])
+def test_inputs_of_the_stated_shape_pass(stated: tuple[int, ...], given: tuple[int, ...]) -> None:
+    require_inputs({"input": torch.zeros(2, *given)}, Points(stated))
+
+
+@pytest.mark.parametrize(
+    "stated, given", [((2,), (1,)), ((9, 3), (10, 3)), ((9, 3), (9, 4)), ((3, 8, 8), (8, 8, 3))]
+)
+def test_inputs_of_another_shape_are_refused(stated: tuple[int, ...], given: tuple[int, ...]) -> None:
+    message = (
+        rf"Points gives inputs of shape {re.escape(str(given))}, .* input_shape = {re.escape(str(stated))}"
+    )
+    with pytest.raises(DataError, match=rf"{message}.*Points\.prepare \(tests/test_returned\.py, line \d+\)"):
+        require_inputs({"input": torch.zeros(2, *given)}, Points(stated))
+
+
+def test_splits_of_another_type_are_refused() -> None:
+    splits = Splits([], [], [])  # type: ignore[arg-type]
+    assert require_splits(Points((1,), splits)) is splits
+    with pytest.raises(
+        DataError, match=r"Points\.splits returned an object of type tuple.*Splits\(train, validation"
+    ):
+        require_splits(Points((1,), ([], [], [])))
+
+
+class Count(Metric):
+    bibtex = ""
+    columns: ClassVar[dict[str, str]] = {"count": "number"}
+
+    def __init__(self, returned: Any) -> None:
+        super().__init__()
+        self.returned = returned
+
+    def update(self, prediction: Any) -> None: ...
+
+    def compute(self) -> Any:
+        return self.returned
+
+
+@pytest.mark.filterwarnings("ignore:The ``compute`` method")
+@pytest.mark.parametrize(
+    "returned, given", [(torch.ones(()), "a Tensor"), ({"cuont": torch.ones(())}, "cuont")]
+)
+def test_a_metric_without_the_numbers_of_its_columns_is_refused(returned: Any, given: str) -> None:
+    assert numbers([Count({"count": torch.ones(()), "further": torch.ones(())})]) == {
+        "count": 1.0,
+        "further": 1.0,
+    }
+    with pytest.raises(ConfigError, match=rf"Count\.compute returns {given}, .* required: count\."):
+        numbers([Count(returned)])
 
 
 def test_right_parts_pass_and_are_left_as_they_are() -> None:

@@ -72,6 +72,12 @@ def assemble(settings: Settings) -> Assembly:
             raise ConfigError(
                 f"No {group} is chosen. Name an experiment (`experiment=...`; `--help` lists them), or choose an "
                 f"installed {group}: {group}={'|'.join(installed(group))}."
+                + (
+                    " If you have named an encoder of your own, its yaml file must begin with the line `# @package "
+                    "encoder.<name>`."
+                    if group == "encoder"
+                    else ""
+                )
             )
     resolved: Resolved = {
         "data": resolve("data", settings.data),

@@ -3,7 +3,7 @@
 import logging
 import math
 import warnings
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
@@ -139,12 +139,19 @@ def numbers(metrics: "Sequence[Metric]") -> dict[str, float]:
     """Return the numbers that all metrics compute, by name.
 
     Raises:
-        ConfigError: a value is not a single number, or two metrics use the same name.
+        ConfigError: a metric returns no dictionary, or none of the numbers of its columns; a value is not a single
+            number; or two metrics use the same name.
     """
     values: dict[str, float] = {}
     owners: dict[str, Metric] = {}
     for metric in metrics:
         computed: dict[str, Any] = metric.compute()
+        if not isinstance(computed, Mapping) or (metric.columns and not {*metric.columns} & {*computed}):
+            result = ", ".join(computed) if isinstance(computed, Mapping) else f"a {type(computed).__name__}"
+            raise ConfigError(
+                f"{type(metric).__name__}.compute returns {result}, but a dictionary with the names in `columns` is "
+                f"required: {', '.join(metric.columns)}. Return each number under its name, or correct `columns`."
+            )
         for name, value in computed.items():
             require_unique_name(owners, name, metric)
             shape = tuple(getattr(value, "shape", ()))

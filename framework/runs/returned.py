@@ -10,12 +10,42 @@ from typing import Any
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
+from framework.data import Batch, Data, Splits, shape_fits
 from framework.density_head import DensityHead
 from framework.encoder import Encoder
-from framework.errors import ConfigError
+from framework.errors import ConfigError, DataError
 from framework.model import Model, Predictor
 from framework.target import Target
 from framework.uncertainty import Uncertainty
+
+
+def require_splits(data: Data) -> Splits:
+    """Return the splits of a data set.
+
+    Raises:
+        DataError: The method `splits` returns something else than `framework.data.Splits`.
+    """
+    splits = data.splits()
+    if not isinstance(splits, Splits):
+        raise DataError(
+            f"{type(data).__name__}.splits returned {_describe(splits)}, but framework.data.Splits is required. "
+            f"Correct {_locate(data, 'splits')}: return Splits(train, validation, test)."
+        )
+    return splits
+
+
+def require_inputs(batch: Batch, data: Data) -> None:
+    """Require that the inputs have the shape that the data set states, because the encoders are built for this shape.
+
+    Raises:
+        DataError: The inputs have another shape.
+    """
+    shape, expected = tuple(batch["input"].shape[1:]), tuple(data.input_shape)
+    if not shape_fits(shape, expected):
+        raise DataError(
+            f"{type(data).__name__} gives inputs of shape {shape}, but states input_shape = {expected}. Correct "
+            f"input_shape in {_locate(data, 'prepare')}, or the samples of {_locate(data, 'splits')}."
+        )
 
 
 @contextmanager
@@ -101,7 +131,7 @@ def _describe(result: Any) -> str:
     return f"an object of type {type(result).__name__}"
 
 
-def _locate(part: nn.Module, method: str) -> str:
+def _locate(part: object, method: str) -> str:
     """Return the name of a part's method, with its file and line if the source is known."""
     function = getattr(type(part), method)
     name = f"the method {function.__qualname__}"

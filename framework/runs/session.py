@@ -57,7 +57,7 @@ from framework.prediction import Prediction, true_image
 from framework.runs.introduction import introduce, introduce_model, introduce_threads
 from framework.runs.job import refuse_idle
 from framework.runs.resuming import find_resumable, may_resume
-from framework.runs.returned import check_parts, require_losses
+from framework.runs.returned import check_parts, require_inputs, require_losses, require_splits
 from framework.runs.run import Run
 from framework.storage.checkpoints import read, write
 from framework.storage.first_rank import first_rank
@@ -416,10 +416,11 @@ def rehearse(session: Session) -> None:
         bool(fitted_models(session.predictor)),
         {name for metric in session.metrics for name in metric.reads},
     )
-    splits = session.data.splits()
+    splits = require_splits(session.data)
     validation_batch = _first_samples(splits.validation, 2)
     for batch in (_first_samples(splits.train, 2), validation_batch, _first_samples(splits.test, 2)):
         require_targets(batch, session.target)
+        require_inputs(batch, session.data)
     if fitted:
         for channel in sorted(reads):
             true_image(validation_batch, channel)

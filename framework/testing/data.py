@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.data import Batch, Data
+from framework.data import Batch, Data, shape_fits
 from framework.datasets.fields import fetch
 from framework.target import Target
 from framework.testing.data_files import (
@@ -35,7 +35,6 @@ from framework.testing.data_samples import (
     indices_to_check,
     remove_padding,
     samples,
-    shape_fits,
     spaced_indices,
     splits_by_name,
 )

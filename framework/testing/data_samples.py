@@ -95,13 +95,6 @@ def batches(indices: Sequence[int], sizes: Sequence[int]) -> Iterator[list[int]]
         start, count = start + size, count + 1
 
 
-def shape_fits(shape: tuple[int, ...], expected: tuple[int, ...]) -> bool:
-    """Return whether an input has the expected shape; a cloud, (points, columns), may have fewer points."""
-    if len(expected) == 2 and len(shape) == 2:
-        return 0 < shape[0] <= expected[0] and shape[1] == expected[1]
-    return shape == expected
-
-
 def remove_padding(inputs: Tensor) -> Tensor:
     """Return a cloud without its padding, the rows of NaN at its end; return any other input unchanged."""
     if inputs.dim() != 2 or not inputs.is_floating_point():
