@@ -371,27 +371,32 @@ class WrappedNormalHead(DensityHead):
 
 HEADS: Mapping[str, tuple[type[DensityHead], tuple[Target, ...]]] = {
     "Student's t": (StudentTHead, (Target("real", ("height",)), Target("real", ("x", "y")))),
-    "Cauchy": (CauchyHead, (Target("real", ("height",)),)),
-    "Student's t, freedom predicted": (LearnedTHead, (Target("real", ("height",)),)),
+    "Cauchy": (CauchyHead, (Target("real", ("height",)), Target("real", ("x", "y")))),
+    "Student's t, freedom predicted": (
+        LearnedTHead,
+        (Target("real", ("height",)), Target("real", ("x", "y"))),
+    ),
     "Laplace": (LaplaceHead, (Target("real", ("height",)), Target("real", ("x", "y")))),
     "logistic": (LogisticHead, (Target("real", ("height",)), Target("real", ("x", "y")))),
-    "log-normal": (LogNormalHead, (Target("real", ("height",)),)),
+    "log-normal": (LogNormalHead, (Target("real", ("height",)), Target("real", ("x", "y")))),
     "wrapped normal": (
         WrappedNormalHead,
         (Target("angle", ("azimuth",)), Target("angle", ("azimuth", "tilt"))),
     ),
 }
-VALUES: Mapping[str, Callable[[int], Tensor]] = {
-    "log-normal": lambda count: torch.randn(count, 1, generator=torch.Generator().manual_seed(0)).exp()
-}
-"""Name of a head → its targets, if its density is 0 for some real numbers."""
+POSITIVE = ("log-normal",)
+"""Names of the heads whose density is 0 for negative numbers."""
 
 
 def right_findings(name: str, target: Target) -> Iterator[Finding]:
     """Yield all findings of the head with this name."""
     kind = HEADS[name][0]
-    subject = HeadSubject(
-        HeadRow(name, target, values=VALUES.get(name)), lambda: kind(target), build_for=kind
-    )
+
+    def positive(count: int) -> Tensor:
+        generator = torch.Generator().manual_seed(0)
+        return torch.randn(count, len(target.names), generator=generator).exp()
+
+    row = HeadRow(name, target, values=positive if name in POSITIVE else None)
+    subject = HeadSubject(row, lambda: kind(target), build_for=kind)
     yield from examine_head(subject)
     yield from examine_densities(subject)

@@ -59,6 +59,8 @@ GRID = 2880
 """Number of angles of the grid with which trigonometric moments are compared."""
 CELLS = 24
 """Number of cells of about equal mass in which draws of one number are counted."""
+STRIPS = 12
+"""Number of strips of about equal mass in which draws of two numbers are counted; each strip has as many cells."""
 MEDIAN_DRAWS = 2000
 """Number of draws from which a median is estimated, where it has no closed form."""
 Check = Callable[[Distribution, Worst], None]
@@ -224,15 +226,17 @@ def integral(density: Distribution, worst: Worst) -> None:
     A density of one or two numbers or of three angles is integrated by adaptive quadrature. A density of three real
     numbers is integrated on a grid, whose centre and width are determined by draws.
     """
+    resolved = torch.ones(density.batch_shape, dtype=torch.bool)
     if density.event_shape in ((1,), (2,)):
         quadrature = boxes(density)
-        total = quadrature.mean(torch.ones_like(quadrature.log_prob))
+        total, resolved = quadrature.mean(torch.ones_like(quadrature.log_prob)), quadrature.resolved
     elif density.event_shape == (3,) and not isinstance(density.support, Circular):
         total = cells_around_draws(density).mass.sum((0, 1, 2))
     else:
         _, mass = cells(density)
         total = mass.sum(tuple(range(max(1, len(density.event_shape) and density.event_shape[0]))))
-    worst.record((total - 1).abs(), lambda at: f"{worst.row(at[0])}: {total[at].item():.9g}")
+    gap = (total - 1).abs().where(resolved, 0.0)
+    worst.record(gap, lambda at: f"{worst.row(at[0])}: {total[at].item():.9g}")
 
 
 def integral_by_draws(density: Distribution, worst: Worst) -> None:
@@ -282,15 +286,18 @@ def integral_by_draws(density: Distribution, worst: Worst) -> None:
 def samples_follow_log_prob(density: Distribution, worst: Worst) -> None:
     """Check by a χ² test over cells that draws follow log_prob; the error is a standard normal deviate.
 
-    χ² is converted to a normal deviate by the formula of Wilson & Hilferty (1931). Draws of one number are counted in
-    cells of equal mass from the quadrature, draws of several numbers on a grid. If the numbers are real, further draws
-    determine the centre, the width and the axes of the grid. Cells with an expectation of fewer than five draws are
-    merged into one.
+    χ² is converted to a normal deviate by the formula of Wilson & Hilferty (1931). Draws of one or two numbers are
+    counted in cells of about equal mass from the adaptive quadrature, draws of three numbers on a grid. If three
+    numbers are real, further draws determine the centre, the width and the axes of the grid. Cells with an expectation
+    of fewer than five draws are merged into one.
     """
     seed(SEED)
     draws = density.sample(torch.Size((DRAWS,)))
     if density.event_shape == (1,):
         _compare_draws(density, draws, worst, "")
+        return
+    if density.event_shape == (2,):
+        _compare_pairs(density, draws, worst)
         return
     if density.event_shape and not isinstance(density.support, Circular):
         grid = cells_around_draws(density)
@@ -330,6 +337,39 @@ def _compare_draws(density: Distribution, draws: Tensor, worst: Worst, prefix: s
     count = torch.zeros_like(expected).scatter_add_(0, cell.gather(0, box), torch.ones_like(coordinate))
     worst.finite(f"{prefix}draws", draws)
     _chi_square(DRAWS * expected, count, worst, prefix)
+
+
+def _compare_pairs(density: Distribution, draws: Tensor, worst: Worst) -> None:
+    """Check by a χ² test that draws follow a density of two numbers.
+
+    The boxes of the quadrature are sorted by their first number and divided into strips of about equal mass; the boxes
+    of each strip are sorted by their second number and divided into cells of about equal mass.
+    """
+    worst.finite("draws", draws)
+    quadrature = boxes(density)
+    count, mass = quadrature.count(draws), quadrature.mass
+    middle = (quadrature.low + quadrature.high) / 2
+    strip = _equal_shares(middle[..., 0], mass, STRIPS)
+    # the strips lie one after another along the second axis, whose coordinates all are in one interval
+    length = 1 + (quadrature.mapping.ends[1] - quadrature.mapping.ends[0])[:, 1]
+    cell = _equal_shares(strip * length + middle[..., 1], mass, STRIPS**2)
+    expected, counted = (
+        torch.zeros(STRIPS**2, mass.shape[1], dtype=torch.float64).scatter_add_(0, cell, part)
+        for part in (DRAWS * mass.where(quadrature.resolved, 0.0), count.where(quadrature.resolved, 0.0))
+    )
+    _chi_square(expected, counted, worst, "")
+
+
+def _equal_shares(place: Tensor, mass: Tensor, count: int) -> Tensor:
+    """Return the number of the share, 0 to `count` - 1, to which each box belongs if the boxes are sorted by `place`.
+
+    All shares have about the same mass; `place` and `mass` have the shape (box, rows).
+    """
+    order = place.argsort(0)
+    sorted_mass = mass.gather(0, order)
+    middle = sorted_mass.cumsum(0) - sorted_mass / 2
+    share = (count * middle / sorted_mass.sum(0)).long().clamp(0, count - 1)
+    return torch.zeros_like(share).scatter_(0, order, share)
 
 
 def _chi_square(expected: Tensor, count: Tensor, worst: Worst, prefix: str) -> None:
@@ -414,7 +454,9 @@ def entropy(density: Distribution, worst: Worst) -> None:
         log_prob = density.log_prob(density.enumerate_support()).double()
         expected = -(log_prob.exp() * log_prob.clamp(min=-1e4)).sum(0)
     elif density.event_shape in ((1,), (2,)):
-        expected = boxes(density).entropy()
+        quadrature = boxes(density)
+        # of a density that float64 does not resolve, only the entropy is left
+        expected = torch.where(quadrature.resolved, quadrature.entropy(), entropies.mean(0))
     else:
         draws = density.sample(torch.Size((DRAWS,)))
         surprise = _surprise(density, draws)
@@ -565,11 +607,11 @@ def moments(density: Distribution, worst: Worst) -> None:
             stated[name] = getattr(density, name).double()
         except (NotImplementedError, AttributeError):
             worst.count(False, f"the density has no {name}")
-    none = torch.zeros_like(variance, dtype=torch.bool)
+    none = ~quadrature.resolved.unsqueeze(-1).expand_as(variance)
     if "variance" in stated:
         huge = variance + second > 1e6 * quadrature.mapping.scale.square()
         # for tails just too heavy for a variance, the integral is not huge within the range of the quadrature
-        none = ~stated["variance"].isfinite() & (huge | (100 * second > variance))
+        none = none | (~stated["variance"].isfinite() & (huge | (100 * second > variance)))
         gap = ((stated["variance"] - variance).abs() - 10 * second).clamp(min=0) / variance
         worst.record(gap.where(~none, 0.0), lambda at: f"variance, {worst.row(at[0])}")
     if "mean" in stated:

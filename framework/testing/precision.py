@@ -11,13 +11,15 @@ import torch
 from torch import Tensor
 
 from framework.density_head import DensityHead
+from framework.distributions.circular import Circular, wrap
+from framework.distributions.protocol import mode_candidates
 from framework.testing.finding import Worst
 from framework.testing.head_subject import HeadSubject, as_type, seeded
 
 LIMIT = 32.0
 """Largest error of float32 log-densities that passes, in float32 epsilons."""
 JUMP = 4
-"""Number of float32 epsilons within which the place of a jump of log p is not known."""
+"""Number of float32 epsilons within which the place of a jump or of a narrow peak of log p is not known."""
 
 
 def reference(subject: HeadSubject, worst: Worst, dtype: torch.dtype) -> None:
@@ -51,9 +53,11 @@ def precision(subject: HeadSubject, worst: Worst) -> None:
 
     The error is relative to max(1, |log p|) plus the change of log p from rounding the raw parameters and the value. So
     a large error comes from cancellation inside the head. For a head with parameters of its own, the change from
-    rounding these parameters is added where the error is large. log p may jump, as at the border of a cell in which the
-    density is constant. Within a few float32 epsilons of such a border, the result may be the log-density on either
-    side of it.
+    rounding these parameters is added where the error is large.
+
+    The change to first order is not enough where log p jumps, as at the border of a cell in which the density is
+    constant, or where a component of a mixture is narrower than the rounding of its place. There, any number between
+    the smallest and the largest float64 log-density within a few float32 epsilons of the value is a right result.
     """
     single = subject.make()
     double = copy.deepcopy(single).double()
@@ -78,16 +82,10 @@ def precision(subject: HeadSubject, worst: Worst) -> None:
                 scale = exact.abs().clamp(min=1) + change
                 error = (log_prob - exact).abs() / scale / torch.finfo(torch.float32).eps
             if (error > LIMIT).any() and value.is_floating_point():
-                # the place of a jump is a sum of numbers of the size of the raw parameters, in the target's unit
-                largest = raw.double().abs().flatten(1).amax(1).view(-1, *[1] * (value.dim() - 1))
-                unit = torch.tensor(subject.row.target.scale or 1.0, dtype=torch.float64)
-                place = torch.maximum(value.double().abs(), largest * unit)
-                for step in (sign * JUMP / 2**halving for halving in range(8) for sign in (-1, 1)):
-                    moved = value.double() + step * torch.finfo(torch.float32).eps * place
-                    with torch.no_grad():
-                        beyond = seeded(double, raw.double()).log_prob(moved)
-                    gap = (log_prob - beyond).abs() / scale / torch.finfo(torch.float32).eps
-                    error = torch.where(gap < error, gap, error)
+                near = _log_prob_near(subject, double, raw.double(), value)
+                lowest, highest = (torch.stack([exact, *near]).amin(0), torch.stack([exact, *near]).amax(0))
+                gap = torch.maximum(lowest - log_prob, log_prob - highest).clamp(min=0)
+                error = torch.minimum(error, gap / scale / torch.finfo(torch.float32).eps)
             worst.record(
                 error,
                 lambda at, size=size, where=where, log_prob=log_prob, exact=exact: (
@@ -95,6 +93,27 @@ def precision(subject: HeadSubject, worst: Worst) -> None:
                     f"in float64 {exact[at].item():.9g}"
                 ),
             )
+
+
+def _log_prob_near(subject: HeadSubject, head: DensityHead, raw: Tensor, value: Tensor) -> list[Tensor]:
+    """Return log_prob of a float64 head at places within JUMP float32 epsilons of a value, among them narrow peaks.
+
+    The places of a density are sums of numbers of the size of the raw parameters, in the target's unit. The epsilons
+    are relative to the largest of these numbers and of the value. A peak that is narrower than this rounding is found
+    among the mode and the mode candidates, number by number, since the density may be broad in another number.
+    """
+    largest = raw.abs().flatten(1).amax(1).view(-1, *[1] * (value.dim() - 1))
+    unit = torch.tensor(subject.row.target.scale or 1.0, dtype=torch.float64)
+    reach = JUMP * torch.finfo(torch.float32).eps * torch.maximum(value.double().abs(), largest * unit)
+    with torch.no_grad():
+        density = seeded(head, raw)
+        offset = torch.cat([mode_candidates(density).double(), density.mode.double().unsqueeze(0)]) - value
+        offset = wrap(offset) if isinstance(density.support, Circular) else offset
+        nearest = offset.gather(0, offset.abs().argmin(0, keepdim=True))[0]
+        at_peak = value.double() + nearest.where(nearest.abs() <= reach, 0.0)
+        steps = [sign / 2**halving for halving in range(8) for sign in (-1, 1)]
+        places = (at_peak, *(value.double() + step * reach for step in steps))
+        return [density.log_prob(place) for place in places]
 
 
 def rounding_change(

@@ -9,8 +9,10 @@ import torch
 from framework.density_head import DensityHead
 from framework.target import Target
 from framework.testing.rows import Case, HeadRow
+from plugins.density_head.gaussian.head import GaussianHead
 
 ONE = Target("real", ("height",))
+TWO = Target("real", ("x", "y"))
 THREE = Target("real", ("x", "y", "z"))
 OFFSETS = (0.0, 1e-6, 1.0, -3.0, 40.0, 1e6)
 
@@ -27,8 +29,9 @@ def exact(residual: list[float], scale: list[Any]) -> Any:
 
 
 def predicted_cases(head: DensityHead) -> Iterator[Case]:
-    """Yield cases with σ = floor + exp(r) or floor + (1 + r/4)⁴, mean 0, and coefficients of 0 for three numbers."""
-    numbers = 1 if head.size == 2 else 3
+    """Yield cases with σ = floor + exp(r) or floor + (1 + r/4)⁴, mean 0, and coefficients of 0 for several numbers."""
+    assert isinstance(head, GaussianHead)
+    numbers = head.numbers
     floor = mpmath.mpf(head.floor)  # pyright: ignore[reportArgumentType]  # a number of this head
     for log_scale in (-100.0, -9.0, -1.0, 0.0, 2.0, 40.0, 1e4):
         with mpmath.workdps(50):
@@ -48,6 +51,7 @@ ROWS = {
         HeadRow("one number", ONE, cases=predicted_cases),
         HeadRow("three numbers", THREE, cases=predicted_cases, scale=0.5),
         HeadRow("full covariance", THREE, {"covariance": "full"}, cases=predicted_cases, scale=0.5),
+        HeadRow("two correlated numbers", TWO, {"covariance": "full"}, cases=predicted_cases),
         HeadRow("one spread for all", THREE, {"scale": "fixed", "covariance": "full"}),
         HeadRow(
             "balanced",

@@ -18,6 +18,7 @@ from plugins.density_head.latent.monte_carlo import Effort, NormalPoints
 from plugins.density_head.latent.scvae import SCVAEHead
 
 ONE, TWO = Target("angle", ("azimuth",)), Target("angle", ("azimuth", "elevation"))
+REAL, REALS = Target("real", ("height",)), Target("real", ("x", "y"))
 CLASSES = Target("class", ("a", "b", "c"))
 SMALL = {"latent": 2, "hidden": 16, "training_samples": 5, "samples": 50}
 
@@ -109,6 +110,7 @@ BOUND = {
     "mode": "the mode is that of the mixture",
     "median": "the median is that of the mixture",
     "marginals": "the marginals are those of the mixture",
+    "mean and variance": "they are those of the mixture",
 }
 ADAPTIVE_BOUND = {
     **BOUND,
@@ -123,6 +125,7 @@ ADAPTIVE = {
 }
 MIXTURES = {**SMALL, "component": {"name": "mixture", "components": 2}}
 OF_CLASSES = {**SMALL, "component": {"name": "categorical"}}
+OF_REALS = {**SMALL, "hidden": 8, "samples": 20, "component": {"name": "gaussian"}}
 TOLERANT = {**SMALL, "latent": 1, "tolerance": 0.05}
 # A check draws millions of samples where the tolerance is not reached, and a quadrature over two angles evaluates every
 # component at each of its nodes.
@@ -134,6 +137,8 @@ ROWS = {
         HeadRow("two angles", TWO, SMALL, cases=hard_cases, leave_out=BOUND),
         HeadRow("mixtures", ONE, MIXTURES, leave_out=BOUND),
         HeadRow("classes", CLASSES, OF_CLASSES, leave_out=BOUND),
+        HeadRow("a real number", REAL, OF_REALS, leave_out=BOUND),
+        HeadRow("two real numbers", REALS, OF_REALS, leave_out=BOUND),
         HeadRow("to 0.05 nats", ONE, TOLERANT, leave_out=ADAPTIVE_BOUND),
     ),
     "scvae": (
@@ -147,6 +152,8 @@ ROWS = {
         ),
         HeadRow("mixtures", ONE, MIXTURES),
         HeadRow("classes", CLASSES, OF_CLASSES),
+        HeadRow("a real number", REAL, OF_REALS),
+        HeadRow("two real numbers", REALS, OF_REALS),
         HeadRow(
             "to 0.05 nats",
             ONE,

@@ -15,6 +15,8 @@ ONE = Target("angle", ("azimuth",))
 TWO = Target("angle", ("azimuth", "elevation"))
 VIEWPOINT = Target("angle", ("azimuth", "elevation", "tilt"))
 CLASSES = Target("class", ("a", "b", "c"))
+REAL, REALS = Target("real", ("height",)), Target("real", ("x", "y"))
+GAUSSIANS = {"components": 3, "component": {"name": "gaussian"}}
 NESTED = {"components": 2, "component": {"name": "mixture", "components": 3}}
 
 
@@ -41,7 +43,8 @@ def hard_cases(head: DensityHead) -> Iterator[Case]:
     assert isinstance(head, MixtureHead)
     generator = torch.Generator().manual_seed(7)
     ordinary = torch.randn(6, head.size, generator=generator)
-    value = 3 * torch.randn(6, head.component.size // 3, generator=generator)
+    numbers = head.component(torch.zeros(head.component.size)).event_shape.numel()
+    value = 3 * torch.randn(6, numbers, generator=generator)
     lopsided, narrow = ordinary.clone(), ordinary.clone()
     lopsided[:, 0] += 1e4
     narrow[:, head.components :] *= 30
@@ -64,6 +67,8 @@ ROWS = {
             leave_out={"every raw parameter is read": "the only weight is 1 for any logit"},
         ),
         HeadRow("two angles", TWO, {"components": 3}, cases=hard_cases),
+        HeadRow("a real number", REAL, GAUSSIANS, cases=hard_cases),
+        HeadRow("two real numbers", REALS, GAUSSIANS, cases=hard_cases),
         HeadRow("mixture of mixtures", ONE, NESTED),
         HeadRow(
             "rotations",
