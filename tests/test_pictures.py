@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -289,6 +290,25 @@ def test_a_figure_is_saved_in_the_format_asked_for_and_the_same_again(
         contents.append(path.read_bytes())
         assert path.name == f"curve.{pictures if isinstance(pictures, str) else 'png'}"
     assert contents[0] == contents[1] and contents[0].startswith(KINDS[pictures])
+
+
+@pytest.mark.parametrize(
+    "text", ["\x1b[31m", "\x00", "\ufffe", "\x85", "\u202eab", "\udce9", "--><x/>", "]]>", "&<", "a\nb"]
+)
+@pytest.mark.parametrize("pictures", ["svg", "pdf", "png"])
+def test_a_name_of_another_person_breaks_no_figure(text: str, pictures: str, tmp_path: Path) -> None:
+    figure = titled_figure((3.0, 2.0), text, False)
+    axes = figure.subplots()
+    axes.plot([0, 1], [0, 1], label=text)
+    axes.legend()
+    axes.set_title(text)
+    axes.set_xlabel(text)
+    axes.set_xticks([0, 1], [text, "b"])
+    axes.annotate(text, (0, 0))
+    path = save_figure(figure, tmp_path / "figure", pictures)  # a warning of matplotlib fails the test
+    if pictures == "svg":
+        tags = {element.tag.rpartition("}")[2] for element in ElementTree.parse(path).iter()}
+        assert "svg" in tags and "x" not in tags and "script" not in tags
 
 
 # training curves

@@ -8,8 +8,10 @@ from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from matplotlib.ticker import FuncFormatter
 
-from framework.errors import escape_undecodable
+from framework.errors import escape_unprintable
+from framework.storage.text import BLANKS
 
 # Okabe & Ito 2008, distinguishable by colour-blind people; without yellow, which is too pale for lines on white.
 BLUE, RED, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
@@ -47,7 +49,22 @@ def save_figure(figure: Figure, path: Path, pictures: bool | str) -> Path:
     path = path.with_name(f"{path.name}.{kind}")
     dated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
     for text in figure.findobj(Text):
-        text.set_text(escape_undecodable(text.get_text()))  # fonts draw no byte that is not UTF-8
+        text.set_text(_drawable(text.get_text()))
+    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
+        labels = [label.get_text() for label in axis.get_majorticklabels()]
+        if any(_drawable(label) != label for label in labels):  # the formatter writes these texts again
+            written = axis.get_major_formatter()
+            axis.set_major_formatter(
+                FuncFormatter(lambda value, index, written=written: _drawable(written(value, index)))
+            )
     with rc_context({"pdf.fonttype": 42, "svg.hashsalt": path.stem}):
         figure.savefig(path, dpi=110, metadata=dated.get(kind))
     return path
+
+
+def _drawable(text: str) -> str:
+    """Return a text whose control characters, and bytes that are not UTF-8, are escaped.
+
+    Fonts do not draw them, and XML, in which an SVG stands, does not allow them.
+    """
+    return escape_unprintable(text, allowed="\n\t" + BLANKS)

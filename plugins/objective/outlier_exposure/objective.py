@@ -136,7 +136,11 @@ def far_from(
         rows.flatten(1).float() / 255 if rows.dtype == torch.uint8 else rows.flatten(1)
         for rows in (outliers, inputs)
     )
-    return torch.cdist(outlier_rows, input_rows.to(outlier_rows)).amin(1) >= clearance
+    # products of matrices, torch's default for many rows, would lose the digits of small distances
+    distances = torch.cdist(
+        outlier_rows, input_rows.to(outlier_rows), compute_mode="donot_use_mm_for_euclid_dist"
+    )
+    return distances.amin(1) >= clearance
 
 
 def uniform_range(low: float | None, high: float | None, *, other: bool) -> tuple[float, float]:

@@ -23,7 +23,7 @@ from plugins.objective.outlier_exposure.divergence import (
     to_ignorance,
     to_uniform,
 )
-from plugins.objective.outlier_exposure.objective import OutlierExposure
+from plugins.objective.outlier_exposure.objective import OutlierExposure, far_from
 
 CLASSES = Target("class", ("a", "b", "c"))
 ANGLE = Target("angle", ("azimuth",))
@@ -126,6 +126,19 @@ def test_outliers_among_the_data_are_left_out(kind):
     torch.testing.assert_close(penalty, single)
     all_near = objective(**BOX, clearance=100.0)
     assert all_near(predictor, {"input": inputs}).item() == 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [3, 3000])
+def test_distances_keep_their_digits_however_far_the_inputs_are_from_zero(size, dtype):
+    draws = torch.Generator().manual_seed(0)
+    inputs = 100 + torch.rand(64, size, generator=draws, dtype=dtype)
+    offsets = torch.randn(40, size, generator=draws, dtype=dtype)
+    lengths = torch.linspace(0.005, 0.1, 40, dtype=dtype)[:, None]
+    outliers = inputs[:40] + offsets / torch.linalg.vector_norm(offsets, dim=1, keepdim=True) * lengths
+    exact = np.linalg.norm(outliers.double().numpy()[:, None] - inputs.double().numpy()[None], axis=-1).min(1)
+    assert 10 < (exact >= 0.05).sum() < 30
+    np.testing.assert_array_equal(far_from(outliers, inputs, 0.05).numpy(), exact >= 0.05)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
