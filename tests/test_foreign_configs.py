@@ -52,6 +52,23 @@ BAD = {
     "environment variable in a choice": ("x.yaml", "defaults: [{/a: '${oc.env:HOME}'}]"),
     "path of this machine": ("x.yaml", "a: ${hydra:runtime.cwd}"),
     "alias": ("x.yaml", "a: &a [1]\nb: *a"),
+    "package after a blank": ("experiment/x.yaml", " # @package logger\nuri: http://127.0.0.2"),
+    "package after another header": ("experiment/x.yaml", "# @a b\x85# @package hydra.run\ndir: /somewhere"),
+    "package before the last header": (
+        "experiment/x.yaml",
+        "# @package hydra.run\n" + "# @a b\n" * 100 + "# @package data\ndir: /somewhere",
+    ),
+    "tag that only Hydra reads": (
+        "experiment/x.yaml",
+        HEADED.format(
+            "_global_",
+            "hydra: {run: {dir: /somewhere}}\na: !!python/object/apply:pathlib.Path [x]",
+        ),
+    ),
+    "pairs": ("x.yaml", "a: !!pairs [b: '${oc.env:HOME}']"),
+    "config of a job, optionally": ("experiment/x.yaml", "defaults: [{optional /0@_global_: config}]"),
+    "config of a job, in other words": ("experiment/x.yaml", "defaults: [{a override /0@_global_: config}]"),
+    "choice of no group": ("x.yaml", "defaults: [{'@_global_': 0/config}]"),
 }
 GROUPS = ("experiment", "data", "logger", "a")
 FORMS = (
@@ -110,7 +127,14 @@ def test_what_it_may_say_passes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "argument",
-    ["--experimental-rerun=a.pickle", "--experimental-rerun", "--exp=a", "logger.uri=http://me:secret@host"],
+    [
+        "--experimental-rerun=a.pickle",
+        "--experimental-rerun",
+        "--exp=a",
+        "logger.uri=http://me:secret@host",
+        "hydra.searchpath=[file:///somewhere]",
+        "++hydra.searchpath=[pkg://somewhere]",
+    ],
 )
 def test_flags_that_run_or_store_what_they_should_not_are_refused(argument: str) -> None:
     with pytest.raises(ConfigError) as caught:

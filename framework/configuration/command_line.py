@@ -277,7 +277,8 @@ def _refuse_code_and_passwords(arguments: list[str]) -> None:
     Hydra's option --experimental-rerun unpickles a file.
 
     Raises:
-        ConfigError: An argument chooses or changes a logging config, names a file to unpickle, or contains a password.
+        ConfigError: An argument chooses or changes a logging config, adds configs that are not checked, names a file to
+            unpickle, or contains a password.
     """
     for argument in arguments:
         flag = argument.partition("=")[0]
@@ -292,6 +293,11 @@ def _refuse_code_and_passwords(arguments: list[str]) -> None:
         if argument.lstrip("+").startswith("logger.uri="):
             require_no_password(argument.partition("=")[2].strip("'\""))
         key = argument.lstrip("+~").partition("=")[0]
+        if key == "hydra.searchpath":
+            raise ConfigError(
+                f"{argument} is refused, because the configs of that folder are not checked, and could run code. Use "
+                "--config-dir=<folder> instead."
+            )
         if key.replace(".", "/").startswith(("hydra/job_logging", "hydra/hydra_logging", "hydra/callbacks")):
             raise ConfigError(
                 f"{argument} is refused, because Hydra's logging and callback configs can run code. "

@@ -4,8 +4,10 @@ import re
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
-import yaml
 from hydra._internal.utils import get_args_parser
+from yaml.parser import ParserError
+from yaml.reader import ReaderError
+from yaml.scanner import ScannerError
 
 from framework.configuration.schema import forbid_targets
 from framework.configuration.stored_keys import names_run
@@ -29,6 +31,16 @@ PART_KEYS = {
 """Keys of the launcher and the sweeper that an added config folder may set; others reach other machines."""
 KEY = re.compile(r"[+~]{0,2}(\w+)(?:[./]\w+)*(?:@(\w+)(?:\.\w+)*)?")
 """Pattern of a key that a sweep varies; the groups are the first words of the key and of its package."""
+HEADER = re.compile(r"\s*#\s*@")
+"""Pattern of the lines that Hydra reads before a config, such as `# @package _global_`; blanks may stand before them.
+
+Hydra ends lines where `str.splitlines` does, and reads these lines only at the beginning of a file.
+"""
+SYNTAX = (ReaderError, ScannerError, ParserError, UnicodeDecodeError)
+"""Errors in files that no YAML loader reads.
+
+Hydra's loader reads more than `read_yaml`, for example tags that stand for paths.
+"""
 REFERENCE = re.compile(r"\$\{[\w.\[\]]+\}")
 """Pattern of an interpolation that stands for another value of the config.
 
@@ -78,15 +90,13 @@ def _require_harmless(file: Path, folder: Path, groups: Collection[str]) -> None
     try:
         content = read_yaml(file, "a config", "Correct the file, or remove it from the folder.", ConfigError)
     except ConfigError as error:
-        if isinstance(error.__cause__, yaml.YAMLError | UnicodeDecodeError):
+        if isinstance(error.__cause__, SYNTAX):
             return  # Hydra cannot read it either, and reports the place of the error
         raise
     with file.open(encoding="utf-8") as text:
-        header = re.findall(r"^#\s*@package\s+(.*)$", text.read(), re.MULTILINE)
+        header = [line for line in text.read().splitlines() if HEADER.match(line)]
     below = file.relative_to(folder).with_suffix("").parts
-    if any(re.search("|".join([*OWN, "_name_", "_group_"]), package) for package in header) or {*OWN} & {
-        *below
-    }:
+    if any(re.search("|".join([*OWN, "_name_", "_group_"]), line) for line in header) or {*OWN} & {*below}:
         raise _refusal(file, "sets a part of the config that only the user may set")
     if not isinstance(content, dict):
         return
@@ -112,7 +122,10 @@ def _require_harmless(file: Path, folder: Path, groups: Collection[str]) -> None
     defaults = content.get("defaults") or []
     for entry in defaults if isinstance(defaults, list) else [defaults]:
         for text, name in entry.items() if isinstance(entry, dict) else [(str(entry), "")]:
-            group, _, package = str(text).removeprefix("override ").partition("@")
+            words, _, package = str(text).partition("@")
+            group = words.split(" ")[-1]  # before it stand `override` and `optional`, in any order
+            if isinstance(entry, dict) and not group:
+                raise _refusal(file, f"chooses {quote(entry)}")
             absolute = group.startswith("/") or not _group(file, folder)
             elsewhere = group.lstrip("/") == "hydra/launcher" and name not in LAUNCHERS
             if elsewhere or _is_own(group.lstrip("/"), package) or ".." in f"{group}{name}":

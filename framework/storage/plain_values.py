@@ -63,8 +63,9 @@ def read_yaml(file: Path, expected: str, remedy: str = RESTORE, error: type[User
         error: Class of the errors.
 
     Raises:
-        error: The file is missing or damaged, or contains a tag that stands for a Python object, or an alias. With
-            aliases, a few lines could mean more values than fit into any memory.
+        error: The file is missing or damaged, or contains a tag (!name) or an alias. A tag can stand for a Python
+            object, and programs read it differently. With aliases, a few lines could mean more values than fit into
+            any memory.
     """
     with translate_errors(file, expected, remedy, kind=error):
         text = decode(_content(file, LARGEST_YAML))
@@ -76,6 +77,8 @@ def read_yaml(file: Path, expected: str, remedy: str = RESTORE, error: type[User
                     f"the file contains an alias (*name) or values nested more than {DEEPEST} levels deep, which are "
                     "not allowed"
                 )
+            if getattr(event, "tag", None) is not None:
+                raise ValueError(f"the file contains the tag {shorten(event.tag)}, but tags are not allowed")
         return yaml.load(text, PlainLoader)
 
 
