@@ -60,7 +60,10 @@ class Sent:
 
     def goes_to(self, uri: str, status: str = "KILLED") -> None:
         """Let the run's files name a store."""
-        self.edit("run.json", lambda info: info.update(uri=uri, status=status, run_id="0" * 32, sent=0))
+        self.edit(
+            "run.json",
+            lambda info: info.update(uri=uri, status=status, run_id="0" * 32, sent=0, experiment="dial"),
+        )
         self.edit(
             "config.yaml",
             lambda config: config.update(logger={"name": "mlflow", "uri": uri, "experiment": None}),
@@ -126,6 +129,22 @@ def own_store_that_writes_elsewhere(sent: Sent) -> None:
         journal.write(json.dumps(line) + "\n")
 
 
+def own_store_that_is_changed_by_a_trigger(sent: Sent) -> None:
+    """The store in the place of the default one; the folder of a run's files changes after the run is found."""
+    outputs = sent.run.parents[1]
+    sent.goes_to(f"sqlite:///{outputs}/mlflow.db", "FINISHED")
+    with closing(sqlite3.connect(outputs / "mlflow.db")) as store, store:
+        store.execute("UPDATE experiments SET artifact_location = ?", [str(outputs / "artifacts")])
+        for event in ("INSERT ON tags", "INSERT ON params", "INSERT ON metrics", "UPDATE ON runs"):
+            store.execute(
+                f"CREATE TRIGGER {event.replace(' ', '_')} AFTER {event} BEGIN UPDATE runs SET artifact_uri = "
+                f"'{sent.home / 'planted'}' WHERE artifact_uri <> '{sent.home / 'planted'}'; END"
+            )
+    line = {"n": 10_000, "time": 1.0, "artifact": "results.json", "folder": ""}
+    with (sent.run / "journal.jsonl").open("a") as journal:
+        journal.write(json.dumps(line) + "\n")
+
+
 def own_store_that_is_a_link(sent: Sent) -> None:
     outputs = sent.run.parents[1]
     (outputs / "mlflow.db").unlink()
@@ -136,6 +155,7 @@ def own_store_that_is_a_link(sent: Sent) -> None:
 STORES = [
     *(server, server_of_a_finished_run, server_that_looks_local, database),
     *(store_of_the_users, own_store_that_writes_elsewhere, own_store_that_is_a_link),
+    own_store_that_is_changed_by_a_trigger,
 ]
 
 
@@ -177,7 +197,8 @@ SURVIVED = {("results_of_two_names", name) for name in ("test", "predict", "trai
     for attack in ("journal_linked", "record_piped")
     for name in ("test", "predict", "train from it")
 }
-"""Commands that do not read the file; they succeed and do not change it."""
+SURVIVED |= {("own_store_that_is_changed_by_a_trigger", name) for name in ("resume", "sync")}
+"""Commands that do not read the file, or write to the folder that they checked; they succeed and change nothing."""
 
 
 @pytest.fixture(scope="session")
@@ -304,7 +325,7 @@ def test_a_plugins_command_does_nothing_but_say_a_sentence(
         listener.accept()
 
 
-WRONG = [None, -1, 10**400, "", "\x1b[2J$\\frac{", [], {"a": {"b": [None]}}]
+WRONG = [None, -1, 10**400, "", "\x1b[2J$\\frac{", "\udce9\ud800\ufffe", [], {"a": {"b": [None]}}]
 RESULTS = {
     "method": "m",
     "data": "d",

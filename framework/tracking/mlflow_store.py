@@ -34,6 +34,7 @@ with warnings.catch_warnings():
     from mlflow.entities import Dataset, DatasetInput, InputTag, LoggedModelOutput, Metric, Param, Run, RunTag
     from mlflow.exceptions import MlflowException
     from mlflow.models import Model
+    from mlflow.store.artifact.local_artifact_repo import LocalArtifactRepository
     from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
 
 _log = logging.getLogger(__name__)
@@ -96,10 +97,19 @@ class MlflowStore(Store):
         self._stored = {metric.key: metric.step for metric in run.to_proto().data.metrics}
         self._renamed: set[str] = set()
 
-    def _require_own_files(self, location: str | None) -> None:
-        """Refuse to write files outside the folder of a store that the user did not name."""
-        if not self._info.named:
-            require_own_files(self._info.uri, (location or "",))
+    def _own_folder(self, location: str | None) -> LocalArtifactRepository | None:
+        """Return the folder for files of a store that the user did not name; None for a store that the user named.
+
+        For the latter, MLflow's client finds the folder. It reads the location from the store again, and the database
+        of another person may then state another location, for example after a trigger.
+
+        Raises:
+            DataError: The location lies outside the folder of the store.
+        """
+        if self._info.named:
+            return None
+        require_own_files(self._info.uri, (location or "",))
+        return LocalArtifactRepository(location or "")
 
     def send(self, batch: Sequence[Record]) -> None:
         """Store a batch; MLflow ignores a metric that it has already, with the same key, time, step and value."""
@@ -144,13 +154,15 @@ class MlflowStore(Store):
                 error,
             )
             return
-        self._require_own_files(self._files)
+        own, within = self._own_folder(self._files), f"{place}/{file.name}" if place else file.name
         if place == MODEL and file.is_file():
             self._send_model(file)
+        elif file.is_dir() and own is not None:
+            own.log_artifacts(str(file), within)
         elif file.is_dir():
-            self._client.log_artifacts(
-                self._run_id, str(file), f"{place}/{file.name}" if place else file.name
-            )
+            self._client.log_artifacts(self._run_id, str(file), within)
+        elif file.exists() and own is not None:
+            own.log_artifact(str(file), place or None)
         elif file.exists():
             self._client.log_artifact(self._run_id, str(file), place or None)
         else:
@@ -164,15 +176,18 @@ class MlflowStore(Store):
         model = models[0] if models else None
         if model is None:
             model = self._client.create_logged_model(self._experiment_id, self._model_name, self._run_id)
-        self._require_own_files(model.artifact_location)
+        own = self._own_folder(model.artifact_location)
         description = Model(run_id=self._run_id, model_id=model.model_id)
         description.add_flavor(
             "python_function", loader_module=_LOADER, data=file.name, python_version=platform.python_version()
         )
         with TemporaryDirectory() as folder:
             description.save(str(Path(folder) / "MLmodel"))
-            self._client.log_model_artifact(model.model_id, str(Path(folder) / "MLmodel"))
-        self._client.log_model_artifact(model.model_id, str(file))
+            for part in (Path(folder) / "MLmodel", file):
+                if own is None:
+                    self._client.log_model_artifact(model.model_id, str(part))
+                else:
+                    own.log_artifact(str(part))
         self._client.finalize_logged_model(model.model_id, "READY")
         if model.model_id not in _models(self._client.get_run(self._run_id)):
             self._client.log_outputs(self._run_id, [LoggedModelOutput(model.model_id, 0)])
