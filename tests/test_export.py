@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 from torch.distributions import Distribution
 from torch.onnx._internal.exporter._registration import ONNXRegistry
 
@@ -45,6 +46,7 @@ from framework.testing.contract import contract
 from framework.testing.finding import seed
 from framework.testing.head_subject import values
 from framework.testing.rows import HeadRow
+from plugins.uncertainty.conformal.numpy_prediction_set import PredictionSet
 from tests.conftest import Framework, first_of_each
 
 FITTED = ("ballistic", "extra_trees", "fit_pose", "lorentzian", "xgboost")
@@ -234,6 +236,35 @@ def test_numpy_computes_the_same_prediction_sets(head: str, target: Target, thre
             assert true == found
         else:
             np.testing.assert_allclose(np.ravel(found), np.ravel(true), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("mass", [0.0, 0.5, 0.9, 0.99])
+def test_quantiles_of_numpy_have_their_probability(mass: float) -> None:
+    """Check mixtures of normals with SciPy's distribution function; 0 means the median."""
+    generator = np.random.default_rng(0)
+    for count in (1, 2, 3, 5) * 25:
+        weights, places = generator.dirichlet(np.ones(count)), 3 * generator.normal(size=count)
+        widths = np.exp(generator.normal(size=count))
+        normals = densities.Normal(places[None, :, None], widths[None, :, None])
+        density = densities.Mixture(np.log(weights)[None], normals)
+        ends = np.ravel(density.interval(mass)) if mass else np.ravel(density.median())
+        below = [weights @ stats.norm.cdf(end, places, widths) for end in ends]
+        np.testing.assert_allclose(below, [(1 - mass) / 2, (1 + mass) / 2][: len(ends)], atol=1e-12)
+
+
+@pytest.mark.parametrize("unit", [1e-30, 1e-12, 1e12, 1e30])
+def test_modes_and_sets_of_numpy_do_not_depend_on_the_unit(unit: float) -> None:
+    def mixture(unit: float) -> densities.Mixture:
+        places, widths = np.array([[[0.0], [1.5]]]), np.array([[[1.0], [0.6]]])
+        return densities.Mixture(np.log([[0.3, 0.7]]), densities.Normal(unit * places, unit * widths))
+
+    def results(unit: float) -> list[np.ndarray]:
+        density = mixture(unit)
+        parts = PredictionSet(density, 1.5 + math.log(unit), None).parts()
+        return [density.mode() / unit, np.array(parts) / unit, density.interval(0.9).low / unit]
+
+    for scaled, plain in zip(results(unit), results(1.0), strict=True):
+        np.testing.assert_allclose(scaled, plain, rtol=1e-8)
 
 
 class Computed(ExportedModel):

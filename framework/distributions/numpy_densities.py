@@ -347,9 +347,10 @@ def _quantiles(density: Density, *probabilities: float) -> Array:
         # the bracket is halved where Newton's method leaves it or is slow
         newton = (value + step > low) & (value + step < high) & (np.abs(step) < before / 2)
         new = np.where(newton, value + step, low + (high - low) / 2)
-        finished = (np.abs(excess) <= 4e-16) | (np.abs(new - value) <= 4e-16 * np.abs(value))
+        found = np.abs(excess) <= 4e-16  # the end of a bracket, whose middle is farther away
+        finished = found | (np.abs(new - value) <= 4e-16 * np.abs(value))
         before = np.abs(new - value)
-        value = np.where(excess == 0, value, new)
+        value = np.where(found, value, new)
         if finished.all():
             break
     return value
@@ -674,7 +675,8 @@ class Mixture(Density):
             else:
                 step = bound.gradient / np.maximum(bound.curvature, 1e-300)
             value = value + step
-            if np.all(np.abs(step) <= 1e-9 * (1 + np.abs(value))):
+            width = 1 / np.sqrt(np.maximum(bound.curvature, 1e-300))
+            if np.all(np.abs(step) <= np.maximum(1e-9 * width, 4e-16 * np.abs(value))):
                 break
         best = self.log_prob(value).argmax(0)
         index = best.reshape(1, *best.shape, *(1,) * len(self.event))

@@ -20,7 +20,7 @@ from framework.distributions.protocol import mode_candidates
 FOLD = 12
 """Number of nodes per factor e of the distance from a peak: the distance grows by 8 % from node to node."""
 NEAREST, FARTHEST = 1e-11, 1e11
-"""Smallest and largest distance of nodes from a peak, in the target's unit; the largest is π for angles."""
+"""Smallest and largest distance of nodes from a peak, as multiples of `_unit`; the largest is π for angles."""
 TURN = 720
 """Number of additional nodes, evenly spaced on the circle, for broad humps without a mode candidate."""
 PEAKS, CANDIDATES = 8, 64
@@ -47,8 +47,9 @@ class Ends:
 class Line:
     """The density p of one number, evaluated at nodes whose distances from its peaks have all orders of magnitude.
 
-    The nodes resolve a standard deviation of 1e-9 as well as one of 1e9. Between two nodes, log p is taken to be
-    linear.
+    Their distances are multiples of the width of the peaks, so that they do not depend on the unit of a real number.
+    For peaks of different widths, the nodes resolve a standard deviation of 1e-9 as well as one of 1e9. Between two
+    nodes, log p is taken to be linear.
 
     Args:
         density: density of one real number or angle, event_shape (1,). It may have any batch_shape; the elements of the
@@ -204,8 +205,11 @@ class Line:
         steps = torch.logspace(
             math.log10(NEAREST), math.log10(farthest), count, dtype=torch.float64, device=self.device
         )
-        steps = torch.cat([-steps.flip(0), steps.new_zeros(1), steps])
-        nodes = (places + steps.reshape(-1, 1, 1)).flatten(0, 1)
+        steps = torch.cat([-steps.flip(0), steps.new_zeros(1), steps]).reshape(-1, 1, 1)
+        if math.isinf(self.range[1]):
+            largest = torch.finfo(self.dtype).max / 4  # infinite nodes have no log-density
+            steps = (steps * self._unit()).clamp(-largest, largest)
+        nodes = (places + steps).flatten(0, 1)
         if math.isfinite(self.range[1]):
             low, high = self.range
             turn = grid(TURN, dtype=torch.float64, device=self.device) / (2 * math.pi)
@@ -216,6 +220,11 @@ class Line:
             nodes = wrap(nodes) if self.closed else nodes.clamp(low, high)
         # rounded to the dtype in which the density reads them; a closed circle has no second end
         return nodes.to(self.dtype).double().sort(0).values
+
+    def _unit(self) -> Float[Tensor, "item"]:
+        """Return the geometric mean of the smallest and of the largest peak width of each item."""
+        widths = known_scales(self.density).log()
+        return ((widths.amin(0) + widths.amax(0)) / 2).exp()
 
     def _peaks(self) -> Float[Tensor, "peak item"]:
         """Return the positions of the highest humps, at most PEAKS of each item.

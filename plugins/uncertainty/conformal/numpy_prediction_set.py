@@ -58,11 +58,12 @@ class PredictionSet(Density):
         above = self._above(points)
         # ends lie between neighbouring points of which one is inside
         low, high = points[:-1].copy(), points[1:].copy()
+        cell = high - low
         for _ in range(STEPS):
             middle = low + (high - low) / 2
             same = self._above(middle) == above[:-1]
             low, high = np.where(same, middle, low), np.where(same, high, middle)
-            if np.all(high - low <= 1e-13 * (1 + np.abs(middle))):
+            if np.all(high - low <= 1e-13 * np.maximum(cell, np.abs(middle))):
                 break
         ends = low + (high - low) / 2
         return [self._pairs(*column) for column in zip(points.T, above.T, ends.T, strict=True)]

@@ -9,6 +9,7 @@ from scipy import optimize, stats
 from torch.distributions import Categorical, Independent, MultivariateNormal, Normal
 
 from framework.configuration.schema import build, resolve
+from framework.distributions.affine import AffineDensity
 from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.distributions.density import Mixture, circular_grid
 from framework.distributions.protocol import estimate, marginal, median, mode_candidates, peak_widths
@@ -182,6 +183,28 @@ def test_intervals_of_reals(dtype, spread):
     assert narrowest == pytest.approx(2 * stats.norm.ppf(0.95) * spread, rel=2e-3)
     assert PredictionSet(density, EVERYTHING, "mass").intervals() == [[(-math.inf, math.inf)]] * 3
     assert PredictionSet(density, EVERYTHING, "density").size().tolist() == [math.inf] * 3
+
+
+@pytest.mark.parametrize(
+    ("unit", "dtype"),
+    [
+        *((unit, torch.float32) for unit in (1e-15, 1e15)),
+        *((unit, torch.float64) for unit in (1e-30, 1e-15, 1e15, 1e30)),
+    ],
+)
+@pytest.mark.parametrize("score", ["density", "mass", "quantiles"])
+def test_sets_do_not_depend_on_the_unit(score, unit, dtype):
+    def intervals(unit):
+        base = normal([0.0, 1.5], 1.0, dtype)
+        density = AffineDensity(base, torch.zeros(2, 1, dtype=dtype), torch.full((2, 1), unit, dtype=dtype))
+        thresholds = {"density": 2.5 + math.log(unit), "mass": -math.log(0.1), "quantiles": 0.3 * unit}
+        sets = PredictionSet(density, hot(thresholds[score]), score, 0.9)
+        middle = sets.contains(density.mode + hot([[[1.0]], [[30.0]]]).to(dtype) * unit)
+        assert middle.tolist() == [[True, True], [False, False]]
+        return np.array(sets.intervals()) / unit, sets.size().numpy() / unit
+
+    for scaled, plain in zip(intervals(unit), intervals(1.0), strict=True):
+        np.testing.assert_allclose(scaled, plain, rtol=1e-5, atol=1e-5)
 
 
 def test_far_values_have_scores_that_differ():
