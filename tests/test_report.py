@@ -130,6 +130,7 @@ def test_notes_hold_no_progress_and_a_column_of_one_data_set_is_left_out(tmp_pat
 def test_a_page_loads_nothing_and_runs_nothing_of_a_stranger(tmp_path: Path) -> None:
     more = {"groups": {EVIL: {"nll": 1.0}, "b": {"nll": 1.0}}, "versions": {EVIL: EVIL}, "data": EVIL}
     write_run(tmp_path, EVIL, 0, {"nll": 1.0}, columns={"nll": EVIL}, **more)
+    (tmp_path / "citations.bib").write_text(EVIL)
     page, _, latex = (path.read_text(encoding="utf-8") for path in write_report(tmp_path, tmp_path))
     found = Elements(page)
     assert [tag for tag, _ in found.elements].count("script") == 1

@@ -21,9 +21,13 @@ GREY = "0.4"
 
 
 class _PlainFigure(Figure):
-    """Figure that draws every text as it is: names of users' methods and classes may hold the sign of TeX, $."""
+    """Figure that draws every text as it is: names of users' methods and classes may hold the sign of TeX, $.
+
+    Only characters that no font draws are escaped.
+    """
 
     def draw(self, renderer: RendererBase) -> None:
+        _escape_texts(self)
         for text in self.findobj(Text):
             text.set_parse_math(False)
         super().draw(renderer)
@@ -48,23 +52,28 @@ def save_figure(figure: Figure, path: Path, pictures: bool | str) -> Path:
     kind = pictures if isinstance(pictures, str) else "png"
     path = path.with_name(f"{path.name}.{kind}")
     dated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
-    for text in figure.findobj(Text):
-        text.set_text(_drawable(text.get_text()))
-    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
-        labels = [label.get_text() for label in axis.get_majorticklabels()]
-        if any(_drawable(label) != label for label in labels):  # the formatter writes these texts again
-            written = axis.get_major_formatter()
-            axis.set_major_formatter(
-                FuncFormatter(lambda value, index, written=written: _drawable(written(value, index)))
-            )
+    _escape_texts(figure)
     with rc_context({"pdf.fonttype": 42, "svg.hashsalt": path.stem}):
         figure.savefig(path, dpi=110, metadata=dated.get(kind))
     return path
 
 
-def _drawable(text: str) -> str:
-    """Return a text whose control characters, and bytes that are not UTF-8, are escaped.
+def _escape_texts(figure: Figure) -> None:
+    """Escape control characters, and bytes that are not UTF-8, in all texts of a figure.
 
-    Fonts do not draw them, and XML, in which an SVG stands, does not allow them.
+    The names of classes, methods and files may come from another person. Fonts do not draw these characters, and XML,
+    of which an SVG consists, does not allow them.
     """
+    for text in figure.findobj(Text):
+        text.set_text(_escape(text.get_text()))
+    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
+        labels = [label.get_text() for label in axis.get_majorticklabels()]
+        if any(_escape(label) != label for label in labels):  # the formatter would write these texts again
+            written = axis.get_major_formatter()
+            axis.set_major_formatter(
+                FuncFormatter(lambda value, index, written=written: _escape(written(value, index)))
+            )
+
+
+def _escape(text: str) -> str:
     return escape_unprintable(text, allowed="\n\t" + BLANKS)

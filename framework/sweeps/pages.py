@@ -348,5 +348,6 @@ def _citations(runs: Sequence[Mapping[str, Any]]) -> str:
             text = read_plain(Path(run["folder"]) / "citations.bib", 2**20).decode(errors="replace")
         except (DataError, OSError):
             continue
+        text = escape_unprintable(text)
         entries.update(dict.fromkeys(entry.strip() for entry in text.split("\n\n") if entry.strip()))
     return folded("BibTeX", preformatted("\n\n".join(entries))) if entries else ""
