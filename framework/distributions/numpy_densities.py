@@ -347,10 +347,10 @@ def _quantiles(density: Density, *probabilities: float) -> Array:
         # the bracket is halved where Newton's method leaves it or is slow
         newton = (value + step > low) & (value + step < high) & (np.abs(step) < before / 2)
         new = np.where(newton, value + step, low + (high - low) / 2)
-        found = np.abs(excess) <= 4e-16  # the end of a bracket, whose middle is farther away
-        finished = found | (np.abs(new - value) <= 4e-16 * np.abs(value))
+        exact = np.abs(excess) <= 4e-16  # the end of a bracket, whose middle is farther away
+        finished = exact | (np.abs(new - value) <= 4e-16 * np.abs(value))
         before = np.abs(new - value)
-        value = np.where(found, value, new)
+        value = np.where(exact, value, new)
         if finished.all():
             break
     return value
