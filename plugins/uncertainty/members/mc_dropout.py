@@ -105,6 +105,10 @@ class MCDropout(Uncertainty):
 
     def _raws(self, model: Model, inputs: Tensor) -> Float[Tensor, "batch sample *raw"]:
         """Return the head's raw parameters for every input under each of its S dropout masks."""
+        if not any(
+            layer.p > 0 for layer in _dropouts(model)
+        ):  # set to 0 after the model was built: equal masks
+            return torch.stack([model.raw(inputs)] * self.samples, 1)
         self.layout = self.layout or layout_of(model, inputs)
         at_once = max(1, AT_ONCE // (len(inputs) * self.layout.widest))
         counts = [min(at_once, self.samples - start) for start in range(0, self.samples, at_once)]

@@ -354,6 +354,22 @@ def test_the_knob_may_be_turned_after_training():
         mcd(torch.randn(2, 4))
 
 
+@pytest.mark.parametrize("count", [0, 1, 2, 6])
+@pytest.mark.parametrize("samples", [1, 5])
+def test_dropout_may_be_set_to_0_after_the_model_was_built(samples, count):
+    """The wrapper `folds` sets the probability of all dropout layers of a group of models."""
+    inner = model()
+    predictor = wrapped(inner, samples)
+    for layer in inner.modules():
+        if isinstance(layer, nn.Dropout):
+            layer.p = 0.0
+    inputs = torch.randn(count, 4)
+    density, alone = predictor(inputs), inner.eval()(inputs)
+    assert density.batch_shape == (count,)
+    labels = torch.zeros(count, dtype=torch.int64)
+    torch.testing.assert_close(density.log_prob(labels), alone.log_prob(labels))
+
+
 def test_more_samples_vary_less():
     mcd, inputs = wrapped(model()), torch.randn(1, 4)
     spread = []
