@@ -716,8 +716,23 @@ def test_words_in_a_file_are_read_as_the_data_set_reads_them(
         with pytest.raises(ValueError, match=f"has no column '{missing}'"):
             script.read_csv(file, [*columns, missing])
     file.write_text("colour,x\nred\n", encoding="utf-8")
-    with pytest.raises(ValueError, match="line 2: a cell is missing or not a number"):
+    with pytest.raises(ValueError, match="line 2: the line has no cell in the column 'x'"):
         script.read_csv(file, ["colour=red", "x"])
+
+
+def test_a_file_of_a_spreadsheet_in_another_notation_gets_a_sentence(tmp_path: Path) -> None:
+    script = importlib.import_module("framework.deployment.exported_folder.predict")
+    file = tmp_path / "new.csv"
+    for sign in ";\t|":
+        file.write_text(f"x{sign}y\n1,5{sign}2\n", encoding="utf-8")
+        with pytest.raises(ValueError, match=r"has one column, 'x.*y'\. Separate the columns by commas"):
+            script.read_csv(file, ["x", "y"])
+    for cell in ("1,5", "1.234,5", "5 %", "Köln"):
+        file.write_text(f'x,y\n1,2\n"{cell}",2\n', encoding="utf-8")
+        with pytest.raises(
+            ValueError, match=f"line 3: the column 'x' holds '{cell}', .* with a decimal point"
+        ):
+            script.read_csv(file, ["x", "y"])
 
 
 def test_missing_numbers_of_a_table_are_read_and_filled(tmp_path: Path) -> None:
@@ -736,7 +751,7 @@ def test_missing_numbers_of_a_table_are_read_and_filled(tmp_path: Path) -> None:
         array[:4], [[1, 2, 0, 0], [math.nan, 4, 1, 0], [5, math.nan, 0, 1], [0, 1, 0, 0]]
     )
     torch.testing.assert_close(preprocessing.module(torch.from_numpy(array)), data.inputs(file))
-    with pytest.raises(ValueError, match="line 3: a cell is missing or not a number"):
+    with pytest.raises(ValueError, match="line 3: the column 'x' holds '', which is not a number"):
         script.read_csv(file, ["x", "y"])
     model = script.Model.__new__(script.Model)
     model._cloud, model._shape, model._dtype, model._fills = False, ["batch", 4], np.dtype("float64"), True

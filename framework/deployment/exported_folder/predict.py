@@ -289,16 +289,31 @@ def read_csv(file: Path, columns: list[str], missing: Sequence[str] = ()) -> NDA
         ValueError: a column is missing, or a cell is not a number.
     """
 
-    def value(cell: str, word: str | None) -> float:
+    def value(cell: str | None, name: str, word: str | None) -> float:
+        if cell is None:
+            raise ValueError(f"the line has no cell in the column {name!r}. Correct the line.")
+        cell = cell.strip()
         is_hole = cell.lower() in missing
-        if word is None:
+        if word is not None:
+            return float(cell == word if word else is_hole)
+        try:
             return math.nan if is_hole else float(cell)
-        return float(cell == word if word else is_hole)
+        except ValueError:
+            raise ValueError(
+                f"the column {name!r} holds {cell[:40]!r}, which is not a number. Write numbers with a decimal point, "
+                "without separators of thousands."
+            ) from None
 
     with file.open(encoding="utf-8-sig", newline="") as stream:
         reader = csv.DictReader(stream)
-        sources = [_source_of(name, reader.fieldnames or ()) for name in columns]
+        header = reader.fieldnames or ()
+        sources = [_source_of(name, header) for name in columns]
         if None in sources:
+            if len(header) == 1 and re.search(r"[;\t|]", header[0]):
+                raise ValueError(
+                    f"{file} has one column, {header[0][:80]!r}. Separate the columns by commas, and write numbers "
+                    "with a decimal point."
+                )
             raise ValueError(
                 f"{file} has no column {columns[sources.index(None)]!r}. The model reads the columns "
                 f"{', '.join(columns)}. A column such as colour=red is read from a column of words, colour."
@@ -310,14 +325,12 @@ def read_csv(file: Path, columns: list[str], missing: Sequence[str] = ()) -> NDA
         rows, unknown = [], Counter[tuple[str, str]]()
         for line in reader:
             try:
-                rows.append([value(line[name].strip(), word) for name, word in filter(None, sources)])
+                rows.append([value(line[name], name, word) for name, word in filter(None, sources)])
                 unknown.update(
                     (name, cell) for name in words if (cell := line[name].strip()) not in words[name]
                 )
-            except (AttributeError, TypeError, ValueError):
-                raise ValueError(
-                    f"{file}, line {reader.line_num}: a cell is missing or not a number. Correct the line."
-                ) from None
+            except ValueError as error:
+                raise ValueError(f"{file}, line {reader.line_num}: {error}") from None
     for (name, cell), count in unknown.items():
         sys.stderr.write(
             f"{file}: the model does not know the word {cell!r} of the column {name!r} ({count} rows); it is read as "
