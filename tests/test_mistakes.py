@@ -297,13 +297,13 @@ DAMAGED = {
     "quote": (TOP + b'seed: "abc\n', r"mine\.yaml, line 3, column 1: while scanning a quoted scalar"),
     "tab": (TOP + b"trainer:\n\tmax_epochs: 1\n", r"mine\.yaml, line 3, column 1: .* found character '\\t'"),
     "twice": (TOP + b"seed: 1\nseed: 2\n", r"mine\.yaml, line 3, column 1: .* found duplicate key seed"),
-    "two documents": (b"---\nseed: 1\n---\nseed: 2\n", r"mine\.yaml, line 3, column 1: .*another document"),
+    "two documents": (b"---\nseed: 1\n---\nseed: 2\n", r"mine\.yaml: .*\(line 3, column 1: .*another document"),
     "alias": (TOP + b"seed: *none\n", r"mine\.yaml: cannot be read as a config \(the file contains an alias"),
     "tag": (
         TOP + b"seed: !!python/object:os.system x\n",
-        r"mine\.yaml, line 2, column 7: could not determine",
+        r"mine\.yaml: .*\(line 2, column 7: the tag \S*python/object:os\.system is not allowed\)",
     ),
-    "key": (TOP + b"? [1, 2]\n: 3\n", r"mine\.yaml, line 2, column 3: .* found unhashable key"),
+    "key": (TOP + b"? [1, 2]\n: 3\n", r"mine\.yaml: .*\(line 2, column 3: .* found unhashable key\)"),
     "null key": (TOP + b"null: 4\n", r"In 'experiment/mine': Incompatible key type 'NoneType'"),
     "null byte": (TOP + b"seed: 1\x00\n", r"#x0000: .*mine\.yaml\", position 27"),
     "latin-1": (

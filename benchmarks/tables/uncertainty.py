@@ -221,9 +221,9 @@ def page() -> None:
         "## Which method wins at which run time",
         "",
         "Each line of the list is for one data set. It names the methods in the order of their run time per row, from "
-        "the fastest on. A method is named only if its log-likelihood is higher than that of one model and of every "
-        "faster method. The gain over one model, in nats, is in brackets, for the smallest and the largest value of "
-        "the knob that is better than all faster methods.",
+        "the fastest on. A method is named only if its log-likelihood is higher than that of every faster method, and "
+        "its gain over one model is larger than two of its standard errors. The gain, in nats, is in brackets, for the "
+        "smallest and the largest value of the knob that is better than all faster methods.",
         "",
         *[winners(rows, name) for name in SETS],
     ]
@@ -296,9 +296,15 @@ def table_of_set(rows: list[dict[str, Any]], name: str) -> list[str]:
 
 
 def winners(rows: list[dict[str, Any]], name: str) -> str:
-    """Return a sentence on the methods that no faster method beats, and that gain over one model, from the fastest."""
+    """Return a sentence on the methods that no faster method beats, and that gain over one model, from the fastest.
+
+    A gain counts if it is larger than two of its standard errors.
+    """
     points = [
-        (point["time"], point["gain"], method) for method in METHODS for point in curve(rows, name, method)
+        (point["time"], point["gain"], method)
+        for method in METHODS
+        for point in curve(rows, name, method)
+        if point["gain"] > 2 * point["gain_error"]
     ]
     best = 0.0
     steps: list[tuple[str, float, float, float, float]] = []  # method, and first and last time and gain
@@ -314,7 +320,7 @@ def winners(rows: list[dict[str, Any]], name: str) -> str:
         + (f", and {high:+.3f} from {last:.2g} µs on)" if last > first else ")")
         for method, first, low, last, high in steps
     ]
-    return f"- {name}: {', '.join(parts)}."
+    return f"- {name}: {', '.join(parts) or 'none'}."
 
 
 def draw_figure(rows: list[dict[str, Any]]) -> None:

@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 import yaml
+from yaml.composer import ComposerError
+from yaml.constructor import ConstructorError
 
 from framework.errors import DataError, UserError, quote, shorten
 from framework.storage.reading import RESTORE, read_bytes, translate_errors
@@ -78,8 +80,16 @@ def read_yaml(file: Path, expected: str, remedy: str = RESTORE, error: type[User
                     "not allowed"
                 )
             if getattr(event, "tag", None) is not None:
-                raise ValueError(f"the file contains the tag {shorten(event.tag)}, but tags are not allowed")
-        return yaml.load(text, PlainLoader)
+                raise ValueError(f"{_place(event.start_mark)}: the tag {shorten(event.tag)} is not allowed")
+        try:
+            return yaml.load(text, PlainLoader)
+        except (ComposerError, ConstructorError) as fault:
+            raise ValueError(f"{_place(fault.problem_mark)}: {fault.context}, {fault.problem}") from fault
+
+
+def _place(mark: Any) -> str:
+    """Return the place of a mark of YAML in its file, as text."""
+    return f"line {mark.line + 1}, column {mark.column + 1}"
 
 
 def is_number(value: Any) -> TypeGuard[int | float]:
