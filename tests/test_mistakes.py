@@ -297,7 +297,10 @@ DAMAGED = {
     "quote": (TOP + b'seed: "abc\n', r"mine\.yaml, line 3, column 1: while scanning a quoted scalar"),
     "tab": (TOP + b"trainer:\n\tmax_epochs: 1\n", r"mine\.yaml, line 3, column 1: .* found character '\\t'"),
     "twice": (TOP + b"seed: 1\nseed: 2\n", r"mine\.yaml, line 3, column 1: .* found duplicate key seed"),
-    "two documents": (b"---\nseed: 1\n---\nseed: 2\n", r"mine\.yaml: .*\(line 3, column 1: .*another document"),
+    "two documents": (
+        b"---\nseed: 1\n---\nseed: 2\n",
+        r"mine\.yaml: .*\(line 3, column 1: .*another document",
+    ),
     "alias": (TOP + b"seed: *none\n", r"mine\.yaml: cannot be read as a config \(the file contains an alias"),
     "tag": (
         TOP + b"seed: !!python/object:os.system x\n",
