@@ -389,6 +389,26 @@ def test_a_column_written_otherwise_is_refused_and_read_by_the_setting_that_is_t
     np.testing.assert_array_equal(numbers(told_of, "b", missing=""), np.arange(30) / 8)
 
 
+def test_a_table_in_another_encoding_is_refused_and_read_by_the_setting_that_is_told(tmp_path: Path) -> None:
+    file, words = tmp_path / "one.csv", "Größe;y\nStraße;5 €\nCafé;7 €\n"
+    file.write_bytes(words.encode("cp1252"))
+    with pytest.raises(
+        DataError, match=r"one\.csv: line 1 contains the byte 0xf6.* data\.encoding=windows-1252 if"
+    ):
+        read_columns(file, Writing())
+    with pytest.raises(DataError, match=r"which Excel calls CSV UTF-8\.$"):
+        read_columns(file)
+    other = Writing(encoding="windows-1252", units=["€"])
+    assert read_columns(file, other).cells == {"Größe": ["Straße", "Café"], "y": ["5 €", "7 €"]}
+    file.write_bytes(b"\xef\xbb\xbf" + words.encode())
+    assert read_columns(file, other).cells["Größe"] == ["Straße", "Café"]
+    file.write_bytes(b"a,b\n1,2\n\x81,3\n")
+    with pytest.raises(
+        DataError, match=r"line 3 contains the byte 0x81, which is not in Windows-1252\. Save"
+    ):
+        read_columns(file, other)
+
+
 WORDS = (
     "0.png",
     "img001.png",

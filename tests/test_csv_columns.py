@@ -83,7 +83,7 @@ def test_the_separator_is_found_by_the_names_and_the_first_row(
         ("a,b\n1,2\n1,2,3", "line 3: the line has 3 cells, but the first line names 2"),
         ("a,b\n1,2\n1\n", "line 3: the line has 1 cells, but the first line names 2"),
         ('a,b\n1,"2', "cannot be read"),
-        (b"a,b\n\xe4,2", "cannot be read .* Save it as UTF-8 text .* Excel calls CSV UTF-8"),
+        (b"a,b\n\xe4,2", "line 2 .* not UTF-8. Save the table as UTF-8, which Excel calls CSV UTF-8"),
         (
             b"PK\x03\x04\x14\x00",
             r"an archive, such as an Excel workbook \(.xlsx\), but plain text is required",

@@ -12,6 +12,7 @@ import itertools
 import math
 import re
 import shlex
+from codecs import BOM_UTF8
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -81,12 +82,15 @@ class Writing:
         decimal: the decimal sign.
         thousands: the sign between groups of three digits, as in 1,234,567; None: no sign.
         units: units that may stand beside the numbers of a column ("%", "$", "kg"). They are removed: 5% becomes 5.
+        encoding: the encoding of the letters. Excel writes windows-1252 in Western European languages, unless "CSV
+            UTF-8" is chosen. A file with the byte-order mark of UTF-8 is always read as UTF-8.
     """
 
     separator: Separator | None = None
     decimal: Literal["point", "comma", ".", ","] = "point"
     thousands: Literal["comma", "point", "space", "apostrophe"] | None = None
     units: list[Words] | None = None
+    encoding: Literal["utf-8", "windows-1252"] = "utf-8"
 
     def __post_init__(self) -> None:
         if self.thousands and GROUPING[self.thousands] == self.sign:
@@ -237,12 +241,12 @@ def describe_choice(chosen: ColumnChoice) -> tuple[str, ...]:
 
 @contextmanager
 def csv_rows(file: Path, missing: str, writing: Writing | None = None) -> Iterator[Any]:
-    """Open a CSV file, UTF-8 with or without a byte-order mark, and yield an iterator of rows, each a list of cells.
+    """Open a CSV file with or without a byte-order mark, and yield an iterator of rows, each a list of cells.
 
     Args:
         file: path of the table.
         missing: end of the message about a file that does not exist.
-        writing: notation of the table.
+        writing: notation of the table; None: UTF-8, and the first line decides the separator.
 
     Raises:
         DataError: the file is missing or unreadable.
@@ -256,13 +260,33 @@ def csv_rows(file: Path, missing: str, writing: Writing | None = None) -> Iterat
         ),
         open_regular(file) as stream,
     ):
-        text.remove_byte_order_mark(stream.peek(text.LOOKED_AT))
-        with io.TextIOWrapper(stream, encoding="utf-8-sig", newline="") as lines:
+        first = stream.peek(text.LOOKED_AT)
+        text.remove_byte_order_mark(first)
+        other = writing is not None and writing.encoding == "windows-1252" and not first.startswith(BOM_UTF8)
+        encoding = "cp1252" if other else "utf-8-sig"
+        with io.TextIOWrapper(stream, encoding=encoding, newline="") as lines:
             try:
                 yield _rows(lines, writing or PLAIN)
             except UnicodeDecodeError:
-                text.decode(read_bytes(file))  # raises an error that names the line
-                raise
+                place = text.place_of_other_encoding(read_bytes(file), encoding)
+                raise DataError(f"{file}: {place}, {_advise_encoding(other, writing is not None)}") from None
+
+
+def _advise_encoding(other: bool, can_set: bool) -> str:
+    """Return the end of a message about a byte that is not in the encoding of a table.
+
+    Args:
+        other: whether the table was read as Windows-1252.
+        can_set: whether the data set has the setting of the encoding.
+    """
+    if other:
+        return "which is not in Windows-1252. Save the table as UTF-8, and remove data.encoding."
+    setting = (
+        ", or set data.encoding=windows-1252 if a program of a Western European Windows wrote it"
+        if can_set
+        else ""
+    )
+    return f"which is not UTF-8. Save the table as UTF-8, which Excel calls CSV UTF-8{setting}."
 
 
 def _rows(lines: io.TextIOWrapper, writing: Writing) -> Any:
@@ -323,7 +347,7 @@ def _first_record(lines: Sequence[str]) -> Sequence[str]:
 def read_columns(
     file: Path, writing: Writing | None = None, missing: str = "a CSV table is expected. Correct the path."
 ) -> Columns:
-    """Read a CSV file, UTF-8 with or without a byte-order mark, with column names in its first line.
+    """Read a CSV file with column names in its first line.
 
     Blank lines are left out. A column without a name is left out if it holds row numbers or nothing.
 

@@ -102,13 +102,20 @@ def decode(content: bytes) -> str:
         ValueError: The bytes have another encoding; the message names the line.
     """
     content = remove_byte_order_mark(content)
+    place = place_of_other_encoding(content, "utf-8")
+    if place:
+        raise ValueError(f"{place}, which is not UTF-8. {SAVE}")
+    return content.decode("utf-8")
+
+
+def place_of_other_encoding(content: bytes, encoding: str) -> str:
+    """Return "line 3 contains the byte 0xfc" for the first byte that is not in an encoding of Python; "" if all are."""
     try:
-        return content.decode("utf-8")
+        content.decode(encoding)
     except UnicodeDecodeError as error:
         line = len(re.split(rb"\r\n|\r|\n", content[: error.start]))
-        raise ValueError(
-            f"line {line} contains the byte 0x{content[error.start]:02x}, which is not UTF-8. {SAVE}"
-        ) from None
+        return f"line {line} contains the byte 0x{content[error.start]:02x}"
+    return ""
 
 
 def lines_of(content: bytes) -> list[str]:

@@ -148,7 +148,7 @@ def test_messages_about_missing_names_suggest_a_remedy(tmp_path: Path) -> None:
     ):
         prepare_data(tmp_path, mirror=["pam"])
     (tmp_path / "angles.csv").write_bytes("file,pan\nä.png,3".encode("latin-1"))
-    with pytest.raises(DataError, match=r"angles\.csv: cannot be read .* Save it as UTF-8 text"):
+    with pytest.raises(DataError, match=r"angles\.csv: line 2 .* not UTF-8\. Save .* data\.encoding="):
         prepare_data(tmp_path)
 
 
