@@ -553,9 +553,10 @@ def each_number(kind: str, made: Made, density: Distribution, value: Tensor) -> 
         if kind not in ("tempered", "mixture of a fold"):  # densities, or at values, of their own
             close(found, combined(kind, made, parts))
         return
+    # the marginal of one number keeps its set, and a CVAE knows the cdf of its marginal only
+    bare = made.parts[0] if kind == "with a set" else density
     parts = [
-        protocol.cdf(protocol.marginal(density, index), value[..., index : index + 1])
-        for index in event(made)
+        protocol.cdf(protocol.marginal(bare, index), value[..., index : index + 1]) for index in event(made)
     ]
     assert (found is None) == any(part is None for part in parts)
     agree(found, None if found is None else torch.stack(parts, -1))
