@@ -7,9 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 SPINS = "1000"
 """Number of times that a waiting OpenMP thread looks for work before it sleeps; this takes some microseconds.
 
-On two free cores, a training step of the main job then takes 0.7 of its time on one core, instead of 0.87 if threads
-sleep at once. If another process uses a core, the step takes 1.4 times as long as on one core, instead of 3 to 8 times
-if threads look for work ten or a hundred times as often (benchmarks/framework/threads.md).
+A thread that sleeps at once must be woken for every operation. A thread that looks for work much longer uses a core for
+nothing while it waits for a thread whose core another process uses (benchmarks/framework/threads.md).
 """
 
 

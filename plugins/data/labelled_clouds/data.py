@@ -59,7 +59,20 @@ class Surfaces:
     data_seed: Seed = 0
 
 
-class ModelNet40(LabelledClouds):
+class FoldersOfClouds(LabelledClouds):
+    """Base class of clouds in folders, which stores by content the files that a model was trained on."""
+
+    _trained: Trained | None = None
+    _own = Trained()
+
+    def state_dict(self) -> Mapping[str, Any]:
+        return (self._trained or self._own).state()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self._trained = restore_trained(state, type(self).__name__)
+
+
+class ModelNet40(FoldersOfClouds):
     """CAD models of everyday objects, as points drawn from their surfaces, z up; generated if no root is given.
 
     The points of a mesh depend only on `data_seed` and the name of the file. They are drawn once and stored in the
@@ -98,14 +111,6 @@ class ModelNet40(LabelledClouds):
         self.unreadable: Unreadable = unreadable
         self.validation_share = validation_share
         self.rotations = rotations
-        self._trained: Trained | None = None
-        self._own = Trained()
-
-    def state_dict(self) -> Mapping[str, Any]:
-        return (self._trained or self._own).state()
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self._trained = restore_trained(state, type(self).__name__)
 
     def load_clouds(self) -> CloudSet:
         if self.root is None:
@@ -150,7 +155,7 @@ class ModelNet40(LabelledClouds):
         )
 
 
-class PointCloudFolder(LabelledClouds):
+class PointCloudFolder(FoldersOfClouds):
     """A user's own meshes and clouds in folders that are named by class; the target is the class.
 
     Points of meshes are drawn from their surfaces, uniformly by area. Clouds are used unchanged, each with its own
@@ -193,14 +198,6 @@ class PointCloudFolder(LabelledClouds):
         self.columns = self.reading.all_columns
         self.unreadable: Unreadable = unreadable
         self.shares = (validation, test)
-        self._trained: Trained | None = None
-        self._own = Trained()
-
-    def state_dict(self) -> Mapping[str, Any]:
-        return (self._trained or self._own).state()
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self._trained = restore_trained(state, type(self).__name__)
 
     def load_clouds(self) -> CloudSet:
         if self.root is None:
