@@ -13,6 +13,7 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Seq
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.machinery import PathFinder
+from importlib.util import cache_from_source
 from pathlib import Path
 from typing import Any
 
@@ -299,6 +300,9 @@ def command(forks: Forks, site: Path, base: Path) -> Framework:
         }
         run, output = base / (folder or ""), base / "output.txt"
         own = folder is None or any(item.startswith(("resume=", "hydra.", "-")) for item in arguments)
+        for module in (module for path in paths for module in path.rglob("*.py")):
+            # Python takes compiled code for current where the source has its size and was written in its second.
+            Path(cache_from_source(str(module))).unlink(missing_ok=True)
         code = forks(
             arguments=[
                 *arguments,
