@@ -66,12 +66,15 @@ class Preprocessing(NamedTuple):
         scale: standard deviation of a typical array, of the shape `input_shape`.
         missing: words, in small letters, that mark a missing number in a table, if `module` fills NaN; None if it does
             not.
+        ranges: smallest and largest number of each column in the training rows, (2, *input_shape), in the unit of the
+            user's arrays; the exported model names rows far outside. None if the ranges are not known.
     """
 
     module: nn.Module
     location: Tensor
     scale: Tensor
     missing: tuple[str, ...] | None = None
+    ranges: Tensor | None = None
 
 
 class Data(ABC):

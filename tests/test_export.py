@@ -809,6 +809,23 @@ def test_the_exported_folder_needs_numpy_and_onnxruntime_alone(framework: Framew
         )
         np.testing.assert_allclose(column, other, rtol=1e-5, atol=1e-5)
 
+    # rows far outside the training rows are named by every way to predict
+    (tmp_path / "far.csv").write_text("a,b\n0,1000\n0,1\n")
+    words = [sys.executable, "-S", "-E", "-P", "-c", script, str(tmp_path / "far.csv")]
+    messages = subprocess.run(words, capture_output=True, text=True, check=True).stderr
+    assert "far.csv: 1 of 2 rows lies far outside the training rows" in messages
+    assert "'b' is 1 in one of them, but " in messages
+    lines = [
+        f"import sys; sys.path[:0] = [{str(folder)!r}]",
+        "from predict import load; from serve import _answer",
+        "print(load().far([[0, 1000], [0, 1]]).tolist())",
+        """print(_answer(load(), b'{"inputs": [[0, 1], [0, 1000]]}', False, None).decode())""",
+    ]
+    words = [sys.executable, "-c", "\n".join(lines)]
+    printed = subprocess.run(words, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert json.loads(printed[0]) == [[False, False], [False, True]]
+    assert json.loads(printed[1])["far"] == [0]
+
     # a reader such as `head` may end before everything is printed
     words = [sys.executable, "-S", "-E", "-P", "-c", script, str(tmp_path / "rows.csv")]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as early:

@@ -30,6 +30,7 @@ from torch import Tensor, nn
 from framework.configuration.description import Description
 from framework.configuration.loading import reader
 from framework.data import Preprocessing
+from framework.datasets import input_ranges
 from framework.density_head import Fitted
 from framework.deployment import exported_folder
 from framework.deployment.frozen import freeze_predictor
@@ -641,9 +642,11 @@ def _write_code(modules: list[str], folder: Path) -> list[str]:
     # the scripts are not imported here, because they need packages of the exported folder
     sources = {name: (scripts / f"{name}.py").read_text(encoding="utf-8") for name in SCRIPTS}
     sources |= {name: getsource(importlib.import_module(path)) for path, name in names.items()}
+    sources["input_ranges"] = getsource(input_ranges)
     for name, source in sources.items():
         # in the exported folder, the files import each other by their bare names
         bare = source.replace(f"from {NUMPY} ", "from densities ").replace(f"from {PACKAGE}.", "from ")
+        bare = bare.replace(f"from {input_ranges.__name__} ", "from input_ranges ")
         (folder / f"{name}.py").write_text(bare, encoding="utf-8")
     return list(names.values())
 
@@ -657,6 +660,8 @@ def _input_entry(model: Exporting, shape: Sequence[int | str]) -> dict[str, Any]
         entry["columns"] = list(model.description.columns)
     if model.preprocessing is not None and model.preprocessing.missing is not None:
         entry["missing"] = list(model.preprocessing.missing)
+    if model.preprocessing is not None and model.preprocessing.ranges is not None:
+        entry["low"], entry["high"] = model.preprocessing.ranges.tolist()
     return entry
 
 

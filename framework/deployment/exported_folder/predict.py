@@ -29,6 +29,7 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
+from framework.datasets.input_ranges import describe_far, is_far
 from framework.distributions.numpy_densities import Density, arc_hull, build, hull
 
 MOST_POINTS = 2**13
@@ -50,6 +51,7 @@ class Model:
 
     Attributes:
         description: content of density.json.
+        ranges: smallest and largest number of each column of a table in the training rows, or None.
     """
 
     def __init__(self, folder: str | Path, threads: int = 1) -> None:
@@ -79,6 +81,10 @@ class Model:
         self._random_of_seed: dict[int, list[NDArray[Any]]] = {}
         self._dtype = np.dtype(self.description["input"]["dtype"])
         self._fills = "missing" in self.description["input"]
+        bounds = [self.description["input"].get(name) for name in ("low", "high")]
+        self.ranges: list[NDArray[Any]] | None = (
+            None if None in bounds else [np.asarray(bound, np.float64) for bound in bounds]
+        )
 
     def __call__(self, inputs: Any, seed: int = 0) -> Density:
         """Return the densities for a batch of inputs.
@@ -111,6 +117,29 @@ class Model:
         for value in values:
             _require_finite(value, "distribution parameters")
         return dict(zip(self._outputs, values, strict=True))
+
+    def far(self, inputs: Any) -> NDArray[np.bool_]:
+        """Return which numbers of a table lie far outside the training rows, so that a prediction is not reliable.
+
+        A number is far outside if it lies beyond the range of its column in the training rows by more than the width
+        of this range. A missing number is not far outside.
+
+        Args:
+            inputs: inputs that a call of the model takes.
+
+        Returns:
+            Array (row, column).
+
+        Raises:
+            ValueError: density.json holds no ranges, because the model reads no table or was exported by an older
+                version; or a call of the model would refuse the inputs.
+        """
+        if self.ranges is None:
+            raise ValueError(
+                "density.json holds no ranges of the training rows. Only models of tables have them; export a model "
+                "again that an older version exported."
+            )
+        return is_far(self._array(inputs), *self.ranges)
 
     def _array(self, inputs: Any) -> NDArray[Any]:
         """Return inputs as an array of the type and shape that the network reads, checked."""
@@ -428,6 +457,10 @@ def main(arguments: Mapping[str, Any] | None = None) -> None:
         else:
             inputs = read_array(options.inputs, model.description["input"]["shape"])
         rows = list(model.table(inputs, options.interval))
+        if model.ranges is not None:
+            names = [plain_text(repr(name)) for name in columns or range(inputs.shape[1])]
+            if sentence := describe_far(names, np.asarray(inputs), *model.ranges):
+                sys.stderr.write(f"{options.inputs}: {sentence}.\n")
     except (OSError, ValueError) as error:
         sys.exit(str(error))
     if rows:

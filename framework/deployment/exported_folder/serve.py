@@ -4,7 +4,8 @@
     python serve.py --port 8000
 
 `POST /predict` reads {"inputs": [[...], ...], "interval": 0.9} as JSON, or the bytes of a .npy file
-(`Content-Type: application/octet-stream`), and returns {"predictions": [{...}, ...]}. `GET /model` returns
+(`Content-Type: application/octet-stream`), and returns {"predictions": [{...}, ...]}. For a table, "far" lists
+the rows (from 0) with a number far outside the training rows; their predictions are not reliable. `GET /model` returns
 density.json. The service listens on this machine only (127.0.0.1), unless `--host` names another address.
 """
 
@@ -85,8 +86,13 @@ def _answer(model: Model, content: bytes, binary: bool, interval: Any) -> bytes:
     count = len(inputs) if isinstance(inputs, list) or inputs.ndim else 0
     if count > MOST_ROWS:
         raise ValueError(f"Got {count} inputs, but at most {MOST_ROWS} are allowed in a request.")
+    if model.ranges is not None:
+        inputs = np.asarray(inputs)
     rows = [{name: _finite(cell) for name, cell in row.items()} for row in model.table(inputs, level)]
-    return json.dumps({"predictions": rows}).encode()
+    answer: dict[str, Any] = {"predictions": rows}
+    if model.ranges is not None:
+        answer["far"] = np.flatnonzero(model.far(inputs).any(1)).tolist()
+    return json.dumps(answer).encode()
 
 
 def _finite(cell: Any) -> Any:

@@ -162,7 +162,11 @@ class Tabular(Data):
         scaling, fill = self._input_columns.scaling, self._input_columns.fill
         largest, mean, deviation = (torch.from_numpy(np.asarray(part, np.float64)) for part in scaling)
         missing = None if fill is None else tuple(sorted(self.writing.missing))
-        return Preprocessing(Standardise(scaling, fill), largest * mean, largest * deviation, missing)
+        extent = self._input_columns.extent
+        ranges = None if extent is None else torch.from_numpy(np.stack(extent))
+        return Preprocessing(
+            Standardise(scaling, fill), largest * mean, largest * deviation, missing, ranges=ranges
+        )
 
     @property
     def _input_columns(self) -> InputColumns:

@@ -4,8 +4,9 @@ import logging
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
+from framework.datasets.input_ranges import describe_far
 from framework.errors import quote, shorten
 
 Extent = tuple[Float[np.ndarray, "column"], Float[np.ndarray, "column"]]
@@ -71,22 +72,7 @@ def describe_untested(
     )
 
 
-def is_far(inputs: Float[np.ndarray, "row column"], extent: Extent) -> Bool[np.ndarray, "row column"]:
-    """Return which inputs lie outside the range of the training rows by more than the width of this range.
-
-    An input of a column that is constant in the training rows is far if it differs by more than rounding.
-
-    Args:
-        inputs: The inputs, in the units of the table.
-        extent: The ranges of the columns.
-    """
-    low, high = extent
-    with np.errstate(over="ignore"):  # an infinite width contains every number
-        width = np.maximum(high - low, 1e-6 * np.maximum(np.abs(low), np.abs(high)))
-        return np.asarray((inputs > high + width) | (inputs < low - width))
-
-
-def describe_far(
+def describe_far_rows(
     names: Sequence[str], inputs: Float[np.ndarray, "row column"], extent: Extent | None
 ) -> tuple[str, ...]:
     """Return a remark about rows with inputs far outside the range of the training rows; () if there are none.
@@ -96,25 +82,13 @@ def describe_far(
         inputs: The inputs, in the units of the table.
         extent: The ranges of the columns; None if they are not known.
     """
-    far = np.zeros((0, 0), bool) if extent is None else is_far(inputs, extent)
-    columns = np.flatnonzero(far.any(0)).tolist()
-    if extent is None or not columns:
+    sentence = None if extent is None else describe_far([quote(name) for name in names], inputs, *extent)
+    if sentence is None:
         return ()
-    parts = []
-    for column in columns:
-        low, high = (f"{bound[column]:.10g}" for bound in extent)
-        known = f"{low} in all training rows" if low == high else f"{low} to {high} in the training rows"
-        example = inputs[int(far[:, column].argmax()), column]
-        parts.append(f"{quote(names[column])} is {example:.10g} in one of them, but {known}")
-    count = f"{far.any(1).sum()} of {len(inputs)} rows"
-    return (
-        f"{count} lie far outside the training rows, so that their predictions are not reliable: "
-        f"{shorten('; '.join(parts), 400)}. Check the cells, or train with such rows. If a column only names the rows, "
-        "train without it (data.columns)",
-    )
+    return (f"{sentence}. If a column only names the rows, train without it (data.columns)",)
 
 
 def report_far(names: Sequence[str], inputs: Float[np.ndarray, "row column"], extent: Extent | None) -> None:
-    """Log the remark of `describe_far` as a warning; do nothing if there is none."""
-    for remark in describe_far(names, inputs, extent):
+    """Log the remark of `describe_far_rows` as a warning; do nothing if there is none."""
+    for remark in describe_far_rows(names, inputs, extent):
         _log.warning("tabular: %s.", remark)

@@ -43,7 +43,13 @@ from plugins.data.tabular.levels import (
     levels_in_memory,
     name_of,
 )
-from plugins.data.tabular.remarks import Extent, describe_copies, describe_far, describe_untested, report_far
+from plugins.data.tabular.remarks import (
+    Extent,
+    describe_copies,
+    describe_far_rows,
+    describe_untested,
+    report_far,
+)
 
 Kind = Literal["class", "real", "degrees", "radians"]
 Missing = Literal["error", "skip", "median"]
@@ -267,7 +273,7 @@ def load(
         remarks += describe_copies(inputs[rows], values[rows], split, [cells.lines[row] for row in rows])
     else:
         extent = trained.extent
-        remarks += describe_far(columns, inputs[rows], extent)
+        remarks += describe_far_rows(columns, inputs[rows], extent)
     labels = () if trained is None else trained.labels
     target, encoded = _encode(cells, rows, fitted_rows, values, question, labels)
     if target.kind == "class" and trained is None:

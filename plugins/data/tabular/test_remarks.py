@@ -76,7 +76,7 @@ def test_classes_without_a_test_row_are_named_with_their_numbers_of_rows(tmp_pat
 
 FAR = {
     "beyond": ("x,size\n3,17.5\n", "'size' is 17.5 in one of them, but 1 to 8.125 in the training rows"),
-    "below": ("x,size\n3,-9\n4,2\n", "1 of 2 rows lie far outside the training rows"),
+    "below": ("x,size\n3,-9\n4,2\n", "1 of 2 rows lies far outside the training rows"),
     "another unit": (
         "x,size\n3000,2000\n",
         "'x' is 3000 in one of them, but 0 to 6 in the training rows; 'size' is",
