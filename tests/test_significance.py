@@ -1,4 +1,4 @@
-"""Marks of significance in tables, compared with SciPy's Welch test and with chance."""
+"""Marks of significance in tables, compared with SciPy's tests and with chance."""
 
 import math
 
@@ -6,15 +6,20 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import ttest_ind_from_stats
+from scipy.stats import ttest_ind_from_stats, ttest_rel
 
+from framework.evaluation.pareto import front
 from framework.evaluation.significance import (
     SHARE,
     Mean,
+    holm,
     least_significant,
     mean,
+    paired_difference,
     significantly_best,
 )
+from framework.sweeps.pages import _differences
+from framework.sweeps.results import compare
 
 spreads = st.floats(1e-6, 1e6)
 counts = st.integers(2, 200)
@@ -106,3 +111,80 @@ def test_what_a_result_says_of_its_error() -> None:
         {"x": True},
     ):
         assert math.isnan(mean(unknown, "x", 1).standard_error)
+
+
+def _over_runs(numbers: np.ndarray) -> Mean:
+    """Return the mean over runs, as a table has it."""
+    runs = len(numbers)
+    spread = float(numbers.std(ddof=1)) if runs > 1 else math.nan
+    return mean({"x": float(numbers.mean()), "x_std": spread}, "x", runs)
+
+
+@pytest.mark.parametrize("size", [-1e4, -1.0, 1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("runs", [1, 2, 3, 5, 10])
+@pytest.mark.parametrize("spread", [0.0, 1e-9, 1e-3, 1.0])
+@pytest.mark.parametrize("rounding", ["constant", "random", "to float32"])
+def test_rounding_is_not_significant(size: float, runs: int, spread: float, rounding: str) -> None:
+    random = np.random.default_rng(0)
+    first = size * (1 + spread * random.normal(size=runs))
+    second = {
+        "constant": first * (1 + 1e-7),
+        "random": first * (1 + 1e-7 * (5 + random.normal(size=runs))),
+        "to float32": first.astype(np.float32).astype(np.float64),
+    }[rounding]
+    for pair in ((first, second), (second, first)):
+        found = paired_difference(*pair)
+        assert found.probability == 1 or runs == 1
+        assert abs(found.value) <= found.rounding
+        means = [_over_runs(numbers) for numbers in pair]
+        assert not significantly_best(means, "higher").any()
+        assert front(means, [1.0, 1.0]) == [runs > 1] * 2
+
+
+@pytest.mark.parametrize("size", [-1e4, 1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("runs", [2, 3, 5, 10])
+@pytest.mark.parametrize("relative", [1e-5, 1e-3, 1.0])
+def test_a_small_real_difference_of_pairs_is_found(size: float, runs: int, relative: float) -> None:
+    """The mean difference is three standard errors; the differences between runs are far larger than it."""
+    random = np.random.default_rng(0)
+    first = size * (1 + random.normal(size=runs))
+    noise = random.normal(size=runs)
+    noise = (noise - noise.mean()) / noise.std(ddof=1) * math.sqrt(runs) / 3
+    second = first + relative * size * (1 + noise)
+    found = paired_difference(first.tolist(), second.tolist())
+    assert abs(found.value) / found.standard_error == pytest.approx(3, rel=1e-6)
+    assert found.probability == pytest.approx(ttest_rel(first, second).pvalue, rel=1e-6)
+    assert (found.probability <= 0.05) == (runs >= 5)
+
+
+def test_a_difference_from_an_infinite_number_has_no_p_value() -> None:
+    for second in ([1.0, math.inf], [math.inf, math.inf], [1.0, math.nan]):
+        assert math.isnan(paired_difference([1.0, math.inf], second).probability)
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=8), st.lists(st.floats(0, 1), max_size=8))
+def test_tests_without_p_values_count_as_if_they_were_least_favourable(
+    shown: list[float], others: list[float]
+) -> None:
+    for found, expected in zip(holm(shown, len(others)), holm([*shown, *others]), strict=False):
+        assert found >= expected
+
+
+@pytest.mark.parametrize("rows", [2, 5, 10])
+@pytest.mark.parametrize("runs", [3, 10])
+def test_of_equal_rows_at_most_one_report_in_twenty_has_a_star(rows: int, runs: int) -> None:
+    """Count over random sweeps; the page tests the differences from the row that is best by the same numbers."""
+    random = np.random.default_rng(0)
+    header = {"data": "moons", "columns": {"nll": "NLL"}, "better": {"nll": "lower"}, "overrides": []}
+    starred, sweeps = 0, 500
+    for numbers in random.normal(size=(sweeps, rows, runs)):
+        compared = compare(
+            [
+                {**header, "method": f"row {row}", "seed": seed, "nll": float(numbers[row, seed])}
+                for row in range(rows)
+                for seed in range(runs)
+            ]
+        )
+        assert compared is not None
+        starred += " *</td>" in _differences(compared)
+    assert starred <= 0.05 * sweeps + 2.5 * math.sqrt(0.05 * 0.95 * sweeps)

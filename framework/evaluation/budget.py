@@ -322,14 +322,16 @@ class Bench:
         return paired_difference(*([self.measure.sign * pair[side] for pair in finite] for side in (0, 1)))
 
     def equals(self, setting: Setting, best: Setting) -> bool:
-        """Return whether the error of `setting` exceeds that of `best` by at most one standard error.
+        """Return whether the error of `setting` exceeds that of `best` by at most one standard error, or by rounding.
 
         The standard error is that of the paired difference of the two errors (`worse`). The rule is the
         one-standard-error rule of Breiman et al. (1984), "Classification and regression trees", section 3.4.3, which
         uses the standard error of the best setting instead.
         """
         difference = self.worse(setting, best)
-        return setting == best or difference.value <= difference.standard_error
+        # Each comparison is False if its limit is not known.
+        within = difference.value <= difference.standard_error or difference.value <= difference.rounding
+        return setting == best or within
 
     def compare(self, setting: Setting, chosen: Setting) -> str:
         """Return the run time and the error of a setting, and its difference from the chosen setting, as text."""

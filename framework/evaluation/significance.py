@@ -17,6 +17,15 @@ standard deviations.
 RULE = "every difference significant at 95 %, Welch's t-test"
 """Rule by which differences are significant, as text for the caption of a table or figure."""
 
+ROUNDING = 16 * float(np.finfo(np.float32).eps)
+"""Largest difference of two measured numbers that rounding explains, relative to the larger of them.
+
+Results are means of numbers that a network computes in float32. Each of these comes from sums of many terms, whose
+order depends on the batch size, the number of threads and the device, so that its last bits are not reproducible. Two
+methods that are equal in exact arithmetic therefore differ by a few eps, and by nearly the same amount in every run,
+which no test over runs can tell from a real difference.
+"""
+
 _SOURCES = ("runs", "samples")
 
 
@@ -76,7 +85,8 @@ def least_significant(means: Sequence[Mean]) -> Float[np.ndarray, "means means"]
     the degrees of freedom of B. L. Welch (1947), "The generalization of 'Student's' problem when several different
     population variances are involved", Biometrika 34, 28-35. It is NaN if a standard error is not known, or if one
     standard error was computed over runs and the other over the samples of a single run: the latter does not include
-    the differences between runs.
+    the differences between runs. Between measured means it is at least what rounding explains (`ROUNDING`); exact means
+    have no rounding.
     """
     from scipy.special import stdtrit
 
@@ -94,7 +104,10 @@ def least_significant(means: Sequence[Mean]) -> Float[np.ndarray, "means means"]
     # stdtrit takes no infinite degrees of freedom; beyond 1e9 Student's t is normal to rounding.
     quantile = stdtrit(np.minimum(pooled, 1e9), 1 - SHARE / 2)
     mixed = (sources[:, None] != sources) & (sources[:, None] >= 0) & (sources >= 0)
-    return np.where(mixed, math.nan, quantile * np.hypot(errors[:, None], errors))
+    sizes = np.array([abs(mean.value) if math.isfinite(mean.value) else 0.0 for mean in means], np.float64)
+    measured = (sources[:, None] >= 0) | (sources >= 0)
+    rounding = np.where(measured, ROUNDING * np.maximum(sizes[:, None], sizes), 0.0)
+    return np.where(mixed, math.nan, np.maximum(quantile * np.hypot(errors[:, None], errors), rounding))
 
 
 def significantly_best(
@@ -121,41 +134,55 @@ class Difference:
         value: the mean difference.
         standard_error: standard error of the mean difference; NaN for fewer than two pairs.
         probability: two-sided p-value of Student's t-test for pairs, the probability of so large a difference if the
-            methods are equal; NaN for fewer than two pairs.
+            methods are equal; NaN for fewer than two pairs, 1 if rounding explains the difference.
         pairs: number of pairs.
+        rounding: largest mean difference that rounding explains.
     """
 
     value: float
     standard_error: float
     probability: float
     pairs: int
+    rounding: float
 
 
 def paired_difference(first: Sequence[float], second: Sequence[float]) -> Difference:
     """Return the mean of first - second over pairs, with its standard error and the p-value of a t-test.
 
-    If all differences are equal, the standard error is 0. The p-value is then 1 if the differences are 0, and 0
-    otherwise.
+    If all differences are equal, the standard error is 0. The p-value is then 0, unless rounding explains the
+    difference: if the mean difference is at most `ROUNDING` times the mean size of the numbers, the p-value is 1. Of a
+    pair, the larger size counts.
     """
     from scipy.special import stdtr
 
-    differences = np.asarray(first, np.float64) - np.asarray(second, np.float64)
-    count = len(differences)
-    value = float(differences.mean()) if count else math.nan
-    if count < 2:
-        return Difference(value, math.nan, math.nan, count)
-    error = float(differences.std(ddof=1)) / math.sqrt(count)
-    if error == 0:
-        return Difference(value, 0.0, 1.0 if value == 0 else 0.0, count)
-    return Difference(value, error, float(2 * stdtr(count - 1, -abs(value) / error)), count)
+    numbers = np.asarray([first, second], np.float64)
+    count = numbers.shape[1]
+    if not count:
+        return Difference(math.nan, math.nan, math.nan, 0, math.nan)
+    with np.errstate(invalid="ignore"):  # infinite numbers have no p-value
+        differences = numbers[0] - numbers[1]
+        value, rounding = float(differences.mean()), ROUNDING * float(np.abs(numbers).max(0).mean())
+        error = float(differences.std(ddof=1)) / math.sqrt(count) if count > 1 else math.nan
+    if math.isnan(error):
+        probability = math.nan
+    elif abs(value) <= rounding:
+        probability = 1.0
+    else:
+        probability = float(2 * stdtr(count - 1, -abs(value) / error)) if error > 0 else 0.0
+    return Difference(value, error, probability, count, rounding)
 
 
-def holm(probabilities: Sequence[float]) -> list[float]:
+def holm(probabilities: Sequence[float], others: int = 0) -> list[float]:
     """Return the p-values of several tests, corrected for the number of tests; NaN stays NaN and is not counted.
 
     A test is significant at 5 % if its corrected p-value is at most 0.05. The probability that at least one test of two
     equal methods is significant is then at most 5 % (S. Holm (1979), "A simple sequentially rejective multiple test
     procedure", Scandinavian Journal of Statistics 6, 65-70).
+
+    Args:
+        probabilities: p-values of the tests.
+        others: number of further tests whose p-values are not given, such as those that were not chosen after a look at
+            the results. The correction is the one for the least favourable p-values of these tests.
     """
     order = sorted(
         (index for index, value in enumerate(probabilities) if not math.isnan(value)),
@@ -164,6 +191,6 @@ def holm(probabilities: Sequence[float]) -> list[float]:
     corrected = [math.nan] * len(probabilities)
     largest = 0.0
     for rank, index in enumerate(order):
-        largest = max(largest, min(1.0, (len(order) - rank) * probabilities[index]))
+        largest = max(largest, min(1.0, (len(order) + others - rank) * probabilities[index]))
         corrected[index] = largest
     return corrected

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from framework.errors import ConfigError, DataError, escape_undecodable, escape_unprintable, shorten
 from framework.evaluation.pareto import NOISE, TIME_NOISE, front
-from framework.evaluation.significance import holm, mean, paired_difference
+from framework.evaluation.significance import ROUNDING, holm, mean, paired_difference
 from framework.reports.page import PNG, folded, page, paragraph, picture, plain_table, preformatted, wide
 from framework.reports.table import COST_COLUMNS, format_number, html, latex, machine, markdown
 from framework.runs.job import find_job_folders, read_record
@@ -174,8 +174,9 @@ def _results(compared: Comparison) -> str:
 def _differences(compared: Comparison) -> str:
     """Return a table, as HTML, of the differences of each row from the best row, paired by seed.
 
-    The best row has the best number of the key that `headline` returns. The result is "" if there is only one row, and
-    a sentence if no two rows have two seeds in common.
+    The best row has the best number of the key that `headline` returns. It is chosen by the numbers that are tested, so
+    the pairs of rows without it count among the tests: of all pairs of equal rows, this choice shows the largest
+    differences. The result is "" if there is only one row, and a sentence if no two rows have two seeds in common.
     """
     key = headline(compared)
     if key is None or len(compared.rows) < 2:
@@ -202,7 +203,8 @@ def _differences(compared: Comparison) -> str:
             )
             for index, seeds in zip(others, shared, strict=True)
         ]
-        corrected = holm([difference.probability for difference in differences])
+        tested = sum(not math.isnan(difference.probability) for difference in differences)
+        corrected = holm([difference.probability for difference in differences], math.comb(tested, 2))
         columns.append(
             [
                 f"{format_number(difference.value, difference.standard_error)}{' *' if p <= 0.05 else ''}"
@@ -215,12 +217,12 @@ def _differences(compared: Comparison) -> str:
     ]
     caption = (
         "± standard error over seeds; * significant at 5 % by Student's t-test for pairs, with Holm's correction over "
-        "the rows of a column"
+        f"all pairs of rows; a difference of at most {ROUNDING:.0e} times the numbers counts as rounding"
     )
     heads = ["row", "seeds", *(compared.columns[name] for name in keys)]
     return paragraph(
         f"Each number is that of a row minus that of “{names[best]}”, which has the best {compared.columns[key]}, with "
-        "the same seed. The best row was chosen by the same numbers, so small differences from it are not proof."
+        "the same seed."
     ) + plain_table(heads, lines, caption)
 
 
