@@ -25,6 +25,13 @@ For more values it is faster to compute the log-density at the threshold once, a
 """
 DRAWS = 1000
 """Number of samples of each density over several numbers, from which scores and volumes of its sets are estimated."""
+MARGIN_STEPS = 1000
+"""Number of steps in one unit of log(1 + m) to which this number is rounded before u is taken from it.
+
+m is the margin between the two likeliest classes, nats.
+"""
+GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
+"""Number whose multiples modulo 1 are spread evenly (Knuth 1998, The Art of Computer Programming 3, §6.4)."""
 WIDENED = (1.0, 2.0, 4.0, 8.0)
 """Factors by which a density over several reals is widened, so that samples cover its whole prediction set.
 
@@ -345,8 +352,9 @@ def _label_scores(log_prob: Tensor, every: Float[Tensor, "label *batch"]) -> Ten
     """
     top = every.topk(min(2, len(every)), dim=0).values
     margin = top[0] - top[-1]
-    # u is made of the last digits of the margin, which are equal for equal inputs and differ for different ones
-    share = torch.frac(997 * margin.where(margin.isfinite(), 0.0)).clamp(1e-6, 1 - 1e-6)
+    # Equal inputs must have equal u, also if rounding changes the last bits of the margin, whatever its size.
+    step = (MARGIN_STEPS * margin.where(margin.isfinite(), 0.0).log1p()).round()
+    share = torch.frac(step * GOLDEN_RATIO).clamp(1e-6, 1 - 1e-6)
     less = torch.where(
         _broadcast_labels(every, log_prob) < log_prob, _broadcast_labels(every, log_prob), -math.inf
     ).logsumexp(0)

@@ -9,7 +9,7 @@ from mapie.regression import ConformalizedQuantileRegressor
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.datasets import make_moons
 from torch import nn
-from torch.distributions import Categorical
+from torch.distributions import Categorical, Independent, Normal
 
 from framework.configuration.schema import build, resolve
 from framework.distributions.batch_shapes import Stacked
@@ -164,6 +164,41 @@ def test_wrappers_compose_in_any_order(target):
             density = wrapper(inputs)
             assert isinstance(density, PredictionSet) == (second == "conformal")
             assert density.log_prob(label).isfinite().all() and density.log_prob(label).shape == (80,)
+
+
+@pytest.mark.parametrize("score", ["density", "mass", "quantiles"])
+@pytest.mark.parametrize("kind", ["class", "real"])
+@pytest.mark.parametrize("offset", [1.0, 1e4])
+def test_rounding_takes_no_equal_inputs_out_of_their_sets(score, kind, offset):
+    """Compare the sets of repeated inputs with sets of densities that differ by float32 rounding.
+
+    Four different inputs and whole-number targets give many equal scores, many of them equal to the threshold.
+    """
+    if score == "quantiles" and kind == "class":
+        return
+    target = CLASSES if kind == "class" else Target("real", ("count",))
+    random = torch.Generator().manual_seed(0)
+    for trial in range(20):
+        logits = offset**0.25 * torch.randn(4, 2, generator=random)
+        rounding = torch.zeros(())
+
+        def make(inputs, logits=logits):
+            chosen = logits[inputs[:, 0].long()] * (1 + rounding)  # noqa: B023
+            if kind == "class":
+                return Categorical(logits=chosen.log_softmax(-1), validate_args=False)
+            location = offset * chosen[:, :1].double().round() + 1e-6 * offset * rounding.double()  # noqa: B023
+            return Independent(Normal(location, offset * torch.ones_like(location)), 1, validate_args=False)
+
+        inputs = torch.randint(4, (400, 1), generator=random).float()
+        torch.manual_seed(trial)
+        label = make(inputs).sample()
+        label = label if kind == "class" else offset * (label / offset).round()
+        wrapper = around(PredictorOf(make), target, score=score, miscoverage=0.2)
+        wrapper.calibrate(batches(inputs, label))
+        inside = wrapper(inputs).contains(label)
+        for relative in (-2e-7, -1e-7, 1e-7, 2e-7):
+            rounding = torch.tensor(relative)
+            assert torch.equal(wrapper(inputs).contains(label), inside), (trial, relative)
 
 
 def test_what_is_wrapped_gets_one_half():

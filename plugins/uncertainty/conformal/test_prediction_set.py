@@ -114,7 +114,8 @@ def test_mass_scores_of_classes_by_a_loop():
     scores = PredictionSet(density, EVERYTHING, "mass").scores(density.enumerate_support())
     for item, row in enumerate(density.probs.tolist()):
         best, second = sorted(row, reverse=True)[:2]
-        share = min(max((997 * (math.log(best) - math.log(second))) % 1, 1e-6), 1 - 1e-6)
+        step = round(1000 * math.log1p(math.log(best) - math.log(second)))
+        share = min(max((step * (math.sqrt(5) - 1) / 2) % 1, 1e-6), 1 - 1e-6)
         for label, own in enumerate(row):
             wanted = -math.log(sum(other for other in row if other < own) + (1 - share) * own)
             assert scores[label, item].item() == pytest.approx(wanted, rel=1e-9, abs=1e-9)

@@ -38,6 +38,13 @@ NINETY = 1.645
 """Distance from the mean, in standard deviations, within which a normal density has the probability 0.9."""
 MOST_RESIDUALS = 20_000
 """Largest number of samples whose residuals are stored for "cv_plus"; for so many, split conformal sets are as good."""
+ROUNDING = 1e-5
+"""Amount by which a threshold that several scores share is raised, relative to their unit (`raise_shared`).
+
+Equal inputs, such as rows of a table of categories, have equal scores. A network computes them in float32, and its last
+bits depend on the batch size and the device. Without this amount, sets of such inputs could lose all targets whose score
+equals the threshold.
+"""
 _log = logging.getLogger(__name__)
 
 
@@ -148,7 +155,9 @@ class Conformal(Uncertainty):
             ]
         )
         require_numbers(scores, own_half, "score")
-        self.threshold.fill_(threshold(scores, self.miscoverage))
+        targets = torch.cat([batch["target"] for batch in own_half])
+        unit = float(targets.double().std(correction=0)) if score == "quantiles" else 1.0
+        self.threshold.fill_(raise_shared(threshold(scores, self.miscoverage), scores, unit))
         self.remark = coverage_remark(len(scores), self.miscoverage)
         if self.threshold.isinf():
             _log.warning(
@@ -274,3 +283,16 @@ def threshold(scores: Float[Tensor, "sample"], miscoverage: float) -> float:
     count = len(scores)
     left_out = _left_out(count, miscoverage)  # k is at least 1
     return scores.sort().values[count - left_out].item() if left_out else math.inf
+
+
+def raise_shared(value: float, scores: Float[Tensor, "sample"], unit: float) -> float:
+    """Return a threshold that several scores share, plus an allowance for their rounding; otherwise the threshold.
+
+    Args:
+        value: one of the scores, or infinity.
+        scores: scores of the validation samples.
+        unit: size of typical differences of scores: 1 nat, or the standard deviation of the targets.
+    """
+    allowance = ROUNDING * max(unit, abs(value)) if math.isfinite(value) else 0.0
+    shared = int(((scores - value).abs() <= allowance).sum()) > 1
+    return value + allowance if shared else value
