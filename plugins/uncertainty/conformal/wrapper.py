@@ -41,9 +41,9 @@ MOST_RESIDUALS = 20_000
 ROUNDING = 1e-5
 """Amount by which a threshold that several scores share is raised, relative to their unit (`raise_shared`).
 
-Equal inputs, such as rows of a table of categories, have equal scores. A network computes them in float32, and its last
-bits depend on the batch size and the device. Without this amount, sets of such inputs could lose all targets whose score
-equals the threshold.
+Equal inputs, such as rows of a table of categories, have equal scores. A network computes them in float32, and the last
+bits depend on the batch size and the device. Without this amount, sets of such inputs could lose all targets whose
+score equals the threshold.
 """
 _log = logging.getLogger(__name__)
 
