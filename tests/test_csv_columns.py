@@ -8,11 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from framework.datasets.csv_columns import mostly_numbers, number, numbers, read_columns, require
+from framework.datasets.csv_columns import Writing, mostly_numbers, number, numbers, read_columns, require
 from framework.errors import DataError
 
 
@@ -36,6 +37,54 @@ def test_an_empty_cell_in_a_table_of_one_column_is_a_row(tmp_path: Path) -> None
     columns = read_columns(written(tmp_path, 'a\n1\n""\n\n3\n'))
     assert columns.lines == [2, 3, 5]
     np.testing.assert_array_equal(numbers(columns, "a", missing=None), [1.0, math.nan, 3.0])
+
+
+def test_a_packed_and_a_parquet_table_are_read_as_the_same_table_in_csv(tmp_path: Path) -> None:
+    """All types of columns that pandas writes: numbers of each size, logical values, words, categories and dates."""
+    count = 70_000  # more rows than are read at once
+    random = np.random.default_rng(0)
+    words = random.choice(["red", " blue ", "NA", "1,5", ""], count)
+    frame = pd.DataFrame(
+        {
+            "real": random.normal(size=count) * 10.0 ** random.integers(-300, 300, count),
+            "single": random.normal(size=count).astype(np.float32).astype(np.float64),
+            "whole": random.integers(-(2**62), 2**62, count),
+            "small": pd.array(random.integers(0, 255, count), "UInt8"),
+            "logical": random.random(count) > 0.5,
+            "words": words,
+            "kinds": pd.Categorical(words),
+            "date": pd.date_range("1970-01-01", periods=count, freq="D").date,
+            "empty": [None] * count,
+            "a.b": 1.5,
+        }
+    )
+    frame.loc[3, ["real", "small", "words", "kinds", "date"]] = None
+    frame.to_csv(tmp_path / "table.csv", index=False)
+    content = (tmp_path / "table.csv").read_bytes()
+    (tmp_path / "packed").write_bytes(gzip.compress(content[:9]) + gzip.compress(content[9:]))
+    expected = read_columns(tmp_path / "table.csv")
+    packed = read_columns(tmp_path / "packed")
+    assert packed.cells == expected.cells and packed.lines == expected.lines
+    frame["lists"] = [[1, 2]] * count
+    frame.set_index(np.array([f"row {number}" for number in range(count)])).to_parquet(tmp_path / "parquet")
+    columns = read_columns(tmp_path / "parquet")
+    assert columns.left_out == {
+        "lists": "holds values of type list<element: int64>",
+        "__index_level_0__": "row labels of pandas",
+    }
+    logical = [cell.upper() for cell in expected.cells["logical"]]
+    assert columns.cells == {**expected.cells, "logical": logical}
+    assert columns.lines == [*range(1, count + 1)]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("separator", "semicolon"), ("decimal", "comma"), ("thousands", "space"), ("encoding", "windows-1252")],
+)
+def test_the_notation_of_text_is_refused_for_a_parquet_table(tmp_path: Path, name: str, value: str) -> None:
+    pd.DataFrame({"a": [1.5]}).to_parquet(tmp_path / "table")
+    with pytest.raises(DataError, match=f"data.{name} is set, but the table is a Parquet file"):
+        read_columns(tmp_path / "table", Writing(**{name: value}))
 
 
 @pytest.mark.parametrize("eol", ["\n", "\r\n", "\r"])
@@ -88,7 +137,13 @@ def test_the_separator_is_found_by_the_names_and_the_first_row(
             b"PK\x03\x04\x14\x00",
             r"an archive, such as an Excel workbook \(.xlsx\), but plain text is required",
         ),
-        (gzip.compress(b"a,b\n1,2", mtime=0), "the file is compressed with gzip, but plain text is required"),
+        (gzip.compress(b"a,b\n1,2", mtime=0)[:-9], "Compressed file ended before"),
+        (
+            gzip.compress(bz2.compress(b"a,b\n1,2"), mtime=0),
+            "compressed with bzip2, but plain text is required",
+        ),
+        (gzip.compress(bytes(2**28), 1, mtime=0), "decompresses to more than 134217728 bytes"),
+        (gzip.compress(b"a,b\n" + b"," * 2**25, 1, mtime=0), "decompresses to 33554434 numbers, but at most"),
     ],
 )
 def test_wrong_files_are_refused(tmp_path: Path, content: str | bytes, message: str) -> None:

@@ -7,6 +7,7 @@ the setting that reads it.
 """
 
 import csv
+import gzip
 import io
 import itertools
 import math
@@ -24,11 +25,20 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from framework.datasets.parquet_columns import is_parquet, read_parquet
 from framework.errors import DataError, did_you_mean, quote, shorten
 from framework.storage import text
+from framework.storage.limits import MOST_NUMBERS
 from framework.storage.limits import MOST_TABLE_COLUMNS as MOST_COLUMNS
 from framework.storage.path_marks import Words
-from framework.storage.reading import open_regular, read_bytes, translate_errors
+from framework.storage.reading import (
+    Bounded,
+    most_decompressed,
+    open_regular,
+    read_bytes,
+    require_numbers,
+    translate_errors,
+)
 
 MISSING = frozenset(
     {"", "na", "n/a", "#n/a", "#na", "<na>", "nan", "-nan", "nan(ind)", "-nan(ind)", "null", "none", "nil", "nat", "?"}
@@ -52,7 +62,8 @@ NUMBER_OF_THING = re.compile(
     r"(?i:[_ .-](id|nr|no|num|number|key)\.?|^nr\.?|nummer)$|(?<=[a-z])(I[dD]|N[rRo]|Num|Number|Key)$"
 )
 """Names of columns that often hold the number of a thing: customer_id, PassengerId, Order No., Nr, Kundennummer."""
-
+GZIP = b"\x1f\x8b"
+"""First bytes of a file that is compressed with gzip."""
 CELLS_AT_ONCE = 2**9
 """Number of cells that are sorted into columns at once, which is several times as fast as one by one."""
 MOST_LOOKED_AT = 2000
@@ -240,16 +251,12 @@ def describe_choice(chosen: ColumnChoice) -> tuple[str, ...]:
 
 
 @contextmanager
-def csv_rows(file: Path, missing: str, writing: Writing | None = None) -> Iterator[Any]:
-    """Open a CSV file with or without a byte-order mark, and yield an iterator of rows, each a list of cells.
+def _open_table(file: Path, missing: str) -> Iterator[Bounded]:
+    """Open the file of a table; the block raises a DataError for each error that the file causes.
 
     Args:
         file: path of the table.
         missing: end of the message about a file that does not exist.
-        writing: notation of the table; None: UTF-8, and the first line decides the separator.
-
-    Raises:
-        DataError: the file is missing or unreadable.
     """
     with (
         translate_errors(
@@ -260,16 +267,53 @@ def csv_rows(file: Path, missing: str, writing: Writing | None = None) -> Iterat
         ),
         open_regular(file) as stream,
     ):
-        first = stream.peek(text.LOOKED_AT)
-        text.remove_byte_order_mark(first)
-        other = writing is not None and writing.encoding == "windows-1252" and not first.startswith(BOM_UTF8)
-        encoding = "cp1252" if other else "utf-8-sig"
-        with io.TextIOWrapper(stream, encoding=encoding, newline="") as lines:
-            try:
-                yield _rows(lines, writing or PLAIN)
-            except UnicodeDecodeError:
-                place = text.place_of_other_encoding(read_bytes(file), encoding)
-                raise DataError(f"{file}: {place}, {_advise_encoding(other, writing is not None)}") from None
+        yield stream
+
+
+@contextmanager
+def _csv_rows(file: Path, stream: Bounded, writing: Writing | None = None) -> Iterator[Any]:
+    """Yield an iterator over the rows of a CSV file, each a list of cells; the file may be compressed with gzip.
+
+    Args:
+        file: path of the table.
+        stream: the open file, with or without a byte-order mark.
+        writing: notation of the table; None: UTF-8, and the first line decides the separator.
+
+    Raises:
+        DataError: the text has another encoding.
+    """
+    source: io.BufferedReader | io.BytesIO = stream
+    first = stream.peek(text.LOOKED_AT)
+    if first.startswith(GZIP):
+        source = io.BytesIO(_unpack(stream.read()))
+        first = source.getvalue()[: text.LOOKED_AT]
+    text.remove_byte_order_mark(first)
+    other = writing is not None and writing.encoding == "windows-1252" and not first.startswith(BOM_UTF8)
+    encoding = "cp1252" if other else "utf-8-sig"
+    with io.TextIOWrapper(source, encoding=encoding, newline="") as lines:
+        try:
+            yield _rows(lines, writing or PLAIN)
+        except UnicodeDecodeError:
+            content = source.getvalue() if isinstance(source, io.BytesIO) else read_bytes(file)
+            place = text.place_of_other_encoding(content, encoding)
+            raise DataError(f"{file}: {place}, {_advise_encoding(other, writing is not None)}") from None
+
+
+def _unpack(content: bytes) -> bytes:
+    """Return the decompressed bytes of gzip data, which may have several parts.
+
+    Raises:
+        ValueError: the data decompress to more bytes or cells than `most_decompressed` and `require_numbers` allow.
+        OSError, EOFError: the data are damaged or cut short.
+    """
+    most = most_decompressed(len(content))
+    with gzip.GzipFile(fileobj=io.BytesIO(content)) as unpacker:
+        unpacked = unpacker.read(most + 1)
+    if len(unpacked) > most:
+        raise ValueError(f"the file decompresses to more than {most} bytes")
+    cells = unpacked.count(b"\n") + max(unpacked.count(sign.encode()) for sign in SEPARATORS.values())
+    require_numbers(cells, MOST_NUMBERS, len(content))
+    return unpacked
 
 
 def _advise_encoding(other: bool, can_set: bool) -> str:
@@ -347,9 +391,10 @@ def _first_record(lines: Sequence[str]) -> Sequence[str]:
 def read_columns(
     file: Path, writing: Writing | None = None, missing: str = "a CSV table is expected. Correct the path."
 ) -> Columns:
-    """Read a CSV file with column names in its first line.
+    """Read a table with column names: a CSV file, also one compressed with gzip, or a Parquet file.
 
-    Blank lines are left out. A column without a name is left out if it holds row numbers or nothing.
+    Blank lines are left out. A column without a name is left out if it holds row numbers or nothing. In a Parquet file,
+    a line is a row, counted from 1.
 
     Args:
         file: path of the table.
@@ -358,9 +403,44 @@ def read_columns(
 
     Raises:
         DataError: the file is missing, unreadable or empty; a column name is missing or occurs twice; there is no row;
-            or a row has more or fewer cells than there are names.
+            a row has more or fewer cells than there are names; or a setting of the notation does not apply to a Parquet
+            file.
     """
-    with csv_rows(file, missing, writing) as reader:
+    with _open_table(file, missing) as stream:
+        if is_parquet(stream):
+            _refuse_notation(writing)
+            names, columns, left_out = read_parquet(stream)
+            if not names:
+                raise ValueError("it has no column of numbers, words or dates")
+            header = [text.column_name(name) for name in names]
+            text.require_distinct(header)
+            lines = [*range(1, len(columns[0]) + 1)]
+        else:
+            header, columns, lines = _read_csv(file, stream, writing)
+            left_out = {}
+    if not lines:
+        raise DataError(
+            f"{file} has no row below its first line, but one row per sample is expected. Add the rows."
+        )
+    return _select_named(file, header, columns, lines, writing, left_out)
+
+
+def _refuse_notation(writing: Writing | None) -> None:
+    """Raise a DataError if a setting for the notation of texts is not at its default."""
+    default = Writing()
+    for name in ("separator", "decimal", "thousands", "encoding"):
+        if writing is not None and getattr(writing, name) != getattr(default, name):
+            raise DataError(
+                f"data.{name} is set, but the table is a Parquet file, whose numbers are stored as such. Remove "
+                f"data.{name}, or save the table as CSV."
+            )
+
+
+def _read_csv(
+    file: Path, stream: Bounded, writing: Writing | None
+) -> tuple[list[str], list[list[str]], list[int]]:
+    """Return the names of the columns of a CSV file, the cells of each column, and the line of each row."""
+    with _csv_rows(file, stream, writing) as reader:
         names = next(reader, [])
         if re.fullmatch(r"sep=.?", "".join(names).strip()) and len(names) < 3:
             names = next(reader, [])
@@ -378,12 +458,9 @@ def read_columns(
             lines.extend(numbers_of_lines)
             for column, cells in zip(columns, zip(*rows, strict=True), strict=True):
                 column.extend(map(str.strip, cells))
-    if not lines:
-        raise DataError(
-            f"{file} has no row below its first line, but one row per sample is expected. Add the rows."
-        )
-    _check_blanks(file, header, columns)
-    return _select_named(file, header, columns, lines, writing)
+    if lines:
+        _check_blanks(file, header, columns)
+    return header, columns, lines
 
 
 def _filled_rows(
@@ -420,10 +497,18 @@ def _why_other_width(header: Sequence[str], cells: Sequence[str], writing: Writi
 
 
 def _select_named(
-    file: Path, header: Sequence[str], columns: list[list[str]], lines: list[int], writing: Writing | None
+    file: Path,
+    header: Sequence[str],
+    columns: list[list[str]],
+    lines: list[int],
+    writing: Writing | None,
+    unread: Mapping[str, str],
 ) -> Columns:
-    """Return the columns that have names; a column without a name must hold row numbers or nothing."""
-    left_out: dict[str, str] = {}
+    """Return the columns that have names; a column without a name must hold row numbers or nothing.
+
+    `unread` holds columns of other kinds that were not read, with the reason.
+    """
+    left_out = dict(unread)
     for position, (name, cells) in enumerate(zip(header, columns, strict=True), 1):
         if name:
             continue

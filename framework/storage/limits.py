@@ -83,7 +83,7 @@ MOST_ANNOUNCED = 2**31
 MOST_COLUMNS = 1000
 """Largest number of values (coordinates, colours and others) that a file may store for each vertex."""
 MOST_NUMBERS = 2**24
-"""Number of values to which a compressed archive of a point cloud or body model may decompress, however small it is.
+"""Number of values to which a compressed point cloud, body model or table may decompress, however small it is.
 
 A file with more bytes than this may contain as many values as it has bytes. Each value takes 8 bytes in memory.
 """

@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import pyarrow as pa
 import torch
 from PIL import Image
+from pyarrow import parquet
 
 from framework.storage.checkpoints import MARK
 
@@ -116,6 +118,25 @@ CSV = [
     b"file,pan\n" + b"../" * 10**5 + b",1\n",
     b"a;b\n1;2\n",
 ]
+
+
+def parquets() -> list[bytes]:
+    """Return Parquet tables of a few kilobytes with many equal numbers, long equal words, and many columns."""
+    rows = BOMB // 8
+    tables = [
+        pa.table({"a": pa.DictionaryArray.from_arrays(pa.nulls(rows, pa.int32()), pa.array([0.0]))}),
+        pa.table({"a": pa.DictionaryArray.from_arrays([0] * 10**5, pa.array(["x" * 10**6]))}),
+        pa.table({"a": ["x" * BOMB]}),
+        pa.table({str(number): pa.nulls(1) for number in range(20_000)}),
+        pa.table({}),
+        pa.table([[1], [2]], names=["a", "a"]),
+    ]
+    files = []
+    for table in tables:
+        stream = io.BytesIO()
+        parquet.write_table(table, stream, compression="zstd", store_schema=False)
+        files.append(stream.getvalue())
+    return [*files, b"PAR1" * 3, b"PAR1\x15" + b"\xff" * 100 + b"PAR1"]
 
 
 def plain_png(width: int, height: int, rows: int | None = None) -> bytes:

@@ -14,10 +14,12 @@ from typing import Any
 
 import nibabel
 import numpy as np
+import pyarrow as pa
 import scipy.io
 import torch
 import yaml
 from PIL import Image
+from pyarrow import parquet
 from scipy import sparse
 
 from framework.configuration import loading
@@ -49,6 +51,30 @@ def in_zip(content: bytes, random: np.random.Generator) -> bytes:
                 part.filename, spoilt(inner, random) if number == chosen else inner, part.compress_type
             )
     return packed.getvalue()
+
+
+def parquets() -> list[bytes]:
+    """Return the same table with the encodings and compressions that programs choose."""
+    table = pa.table(
+        {
+            "a": [1.0, None, -1e3, 4.0] * 5,
+            "b": pa.array([2, 3, None, 5] * 5, pa.int16()),
+            "c": ["x", "y", None, "z\nw"] * 5,
+            "d": pa.array(["x", "y", "x", None] * 5).dictionary_encode(),
+            "e": [True, None, False, False] * 5,
+            "f": pa.array([1, 2, None, 4] * 5, pa.timestamp("ms")),
+            "g": [[1], [2, 3], [], None] * 5,
+        }
+    )
+    files = []
+    for compression in ("none", "snappy", "zstd", "gzip"):
+        for version, dictionary in (("1.0", True), ("2.0", False)):
+            stream = io.BytesIO()
+            parquet.write_table(
+                table, stream, compression=compression, data_page_version=version, use_dictionary=dictionary
+            )
+            files.append(stream.getvalue())
+    return files
 
 
 def in_png(content: bytes, random: np.random.Generator) -> bytes:

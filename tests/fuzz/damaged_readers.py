@@ -268,6 +268,9 @@ def tables_and_images() -> Iterator[Reader]:
         b"%d.png,%d,-3.5,train\n" % (row, 10 * row) for row in range(9)
     )
     yield Reader("CSV, tables", "one.csv", [table], columns, crafted=crafted.CSV)
+    packed = [*map(gzip.compress, crafted.CSV), gzip.compress(bytes(2**28), 1)]
+    yield Reader("CSV, packed", "one.csv", [gzip.compress(table, 1)], columns, [in_gzip], packed)
+    yield Reader("Parquet", "one.parquet", whole.parquets(), columns, crafted=crafted.parquets())
     yield Reader(
         "CSV, images with angles",
         "angles.csv",
