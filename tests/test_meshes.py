@@ -6,6 +6,7 @@ import struct
 from itertools import product
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -189,6 +190,57 @@ def test_clouds_are_read_with_their_columns(tmp_path, suffix, content, columns):
     assert cloud.faces.shape == (0, 3)
     assert cloud.columns == columns
     assert cloud.attribute(columns).shape == (2, len(columns))
+
+
+def laser_scan(points, number=3, version="1.2"):
+    """Return a LAS file with map coordinates in millimetres, classes, colours and an attribute of two numbers."""
+    header = laspy.LasHeader(point_format=number, version=version)
+    header.scales, header.offsets = np.full(3, 0.001), np.array([4e5, 5e6, 0.0])
+    header.add_extra_dim(laspy.ExtraBytesParams("Pair", "2f8"))
+    scan = laspy.LasData(header)
+    scan.x, scan.y, scan.z = points.T
+    scan.classification = np.arange(len(points)) % 5
+    scan.intensity = np.arange(len(points))
+    scan["Pair"] = points[:, :2] / 3
+    if "red" in header.point_format.dimension_names:
+        scan.red, scan.green, scan.blue = np.full((3, len(points)), [[0], [32768], [65535]])
+    stream = io.BytesIO()
+    scan.write(stream)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(("version", "number"), [("1.2", 0), ("1.2", 3), ("1.3", 4), ("1.4", 6), ("1.4", 7)])
+def test_a_laser_scan_is_read_with_all_numbers_of_its_points(tmp_path, version, number):
+    points = np.random.default_rng(0).integers(0, 99_999, (50, 3)) / 1000 + [4e5, 5e6, 0.0]
+    file = tmp_path / "scan.LAS"
+    file.write_bytes(laser_scan(points, number, version))
+    mesh = read(file)
+    np.testing.assert_allclose(mesh.vertices, points, rtol=0, atol=1e-9)
+    assert not len(mesh.faces)
+    np.testing.assert_array_equal(mesh.attribute(("classification",))[:, 0], np.arange(50) % 5)
+    np.testing.assert_array_equal(mesh.attribute(("intensity",))[:, 0], np.arange(50))
+    np.testing.assert_array_equal(mesh.attribute(("pair_1", "pair_2")), points[:, :2] / 3)
+    if "red" in mesh.columns:
+        colours = mesh.attribute(("red", "green", "blue"))
+        np.testing.assert_array_equal(colours, np.full((50, 3), [0, 32768 / 65535, 1]))
+
+
+def test_a_laser_scan_that_is_compressed_or_cut_short_is_refused(tmp_path):
+    content = laser_scan(np.full((20, 3), [4e5, 5e6, 1.0]))
+    for name, damaged, message in (
+        (
+            "compressed",
+            content[:104] + bytes([128 + 3]) + content[105:],
+            r"compressed \(LAZ\); save the scan as LAS",
+        ),
+        ("cut", content[:-1], "its 20 points end at byte"),
+        ("records", content[:100] + b"\xff" * 4 + content[104:], "records do not fit between the header"),
+        ("other", b"text", "begins with LASF"),
+    ):
+        file = tmp_path / f"{name}.las"
+        file.write_bytes(damaged)
+        with pytest.raises(DataError, match=rf"{name}\.las.*{message}"):
+            read(file)
 
 
 def test_whole_number_colours_become_shares(tmp_path):

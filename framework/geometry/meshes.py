@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from framework.errors import DataError, did_you_mean, shorten
 from framework.geometry import mesh_files
+from framework.geometry.las import las
 from framework.geometry.mesh_files import COLOURS, Parsed
 from framework.geometry.ply import ply
 from framework.storage.names import as_bytes
@@ -24,6 +25,7 @@ READERS: dict[str, Callable[[bytes], Parsed]] = {
     ".npy": mesh_files.npy,
     ".npz": mesh_files.npz,
     ".xyz": mesh_files.xyz,
+    ".las": las,
 }
 """Parsers of the formats that can be read, by the suffix of the file's name."""
 

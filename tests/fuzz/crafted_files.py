@@ -3,6 +3,7 @@
 import hashlib
 import io
 import json
+import math
 import struct
 import tempfile
 import zipfile
@@ -137,6 +138,32 @@ def parquets() -> list[bytes]:
         parquet.write_table(table, stream, compression="zstd", store_schema=False)
         files.append(stream.getvalue())
     return [*files, b"PAR1" * 3, b"PAR1\x15" + b"\xff" * 100 + b"PAR1"]
+
+
+def las_files() -> list[bytes]:
+    """Return headers of LAS files that announce too many points, records or bytes."""
+    header = bytearray(375 + 30)
+    header[:4], header[24:26] = b"LASF", bytes([1, 4])
+    struct.pack_into(
+        "<HIIBH", header, 94, 375, 375, 0, 6, 30
+    )  # header, offset of points, records, format, size
+    struct.pack_into("<3d", header, 131, 1, 1, 1)
+    files = []
+    for offset, kind, value in (
+        (100, "<I", 2**32 - 1),  # records before the points
+        (105, "<H", 0),  # bytes of a point
+        (105, "<H", 2**16 - 1),
+        (104, "<B", 128 + 6),  # compressed points
+        (131, "<d", math.nan),  # scale
+        (243, "<I", 2**32 - 1),  # records behind the points
+        (247, "<Q", HUGE),  # points
+        (247, "<Q", 2**64 - 1),
+    ):
+        changed = header.copy()
+        struct.pack_into("<Q", changed, 247, 1)
+        struct.pack_into(kind, changed, offset, value)
+        files.append(bytes(changed))
+    return files
 
 
 def plain_png(width: int, height: int, rows: int | None = None) -> bytes:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import laspy
 import nibabel
 import numpy as np
 import pyarrow as pa
@@ -227,6 +228,23 @@ def stl_binary() -> bytes:
 def xyz() -> bytes:
     rows = np.column_stack([VERTICES, COLOURS]).tolist()
     return ("x y z red green blue\n" + "\n".join(" ".join(map(str, row)) for row in rows)).encode()
+
+
+def las_files() -> list[bytes]:
+    """Return a cloud in LAS, without and with colours, times and an attribute of several numbers."""
+    files = []
+    for version, number in (("1.2", 0), ("1.2", 3), ("1.4", 7)):
+        header = laspy.LasHeader(point_format=number, version=version)
+        header.scales, header.offsets = np.full(3, 0.001), VERTICES.mean(0).round()
+        if number == 7:
+            header.add_extra_dim(laspy.ExtraBytesParams("pair", "2f4"))
+        scan = laspy.LasData(header)
+        scan.x, scan.y, scan.z = VERTICES.T
+        scan.classification = np.arange(len(VERTICES)) % 5
+        stream = io.BytesIO()
+        scan.write(stream)
+        files.append(stream.getvalue())
+    return files
 
 
 def bvh() -> bytes:

@@ -126,6 +126,7 @@ def clouds() -> Iterator[Reader]:
     yield Reader("PLY, binary", "two.ply", binary, cloud, crafted=crafted.PLY)
     yield Reader("STL", "one.stl", [whole.stl_text(), whole.stl_binary()], cloud)
     yield Reader("OBJ", "one.obj", [whole.obj()], cloud)
+    yield Reader("LAS", "one.las", whole.las_files(), cloud, crafted=crafted.las_files())
     yield Reader("XYZ", "one.xyz", [whole.xyz()], cloud, crafted=crafted.XYZ)
     yield Reader("NPY, clouds", "one.npy", arrays, cloud, crafted=crafted.NPY)
     yield Reader("NPZ, clouds", "one.npz", packed, cloud, [in_zip], [*crafted.npz("points")])

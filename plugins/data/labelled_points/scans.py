@@ -13,7 +13,7 @@ from framework.datasets.shares import check_shares, choose_splits
 from framework.errors import DataError, did_you_mean, shorten
 from framework.geometry import meshes
 
-SUFFIXES = (".ply", ".npz", ".npy", ".xyz")
+SUFFIXES = (".las", ".ply", ".npz", ".npy", ".xyz")
 """Suffixes of the files that are read; other formats have no column for a label."""
 LAYOUT = (
     f"Set data.root to a folder with the layout <root>/<scan> or <root>/{{train,validation,test}}/<scan>, where the "

@@ -187,4 +187,4 @@ def test_a_folder_without_enough_scans_is_refused(tmp_path):
         prepare(tmp_path)
     data = build("data", resolve("data", "labelled_points"))
     with pytest.raises(DataError, match="expected a scan whose name ends in"):
-        data.read([tmp_path / "points.las"])
+        data.read([tmp_path / "points.laz"])
