@@ -33,6 +33,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "laplace in ensemble": {"uncertainty": ["laplace", "ensemble"]},
     "swag": {"uncertainty": ["swag"], "constant": True},
     "temperature": {"uncertainty": ["temperature"]},
+    "platt": {"uncertainty": ["platt"]},
     "balance 0.5": {"head": {"name": "gaussian", "balance": 0.5}},
     "evidential": {"head": {"name": "evidential"}},
     "student_t": {"head": {"name": "student_t"}},
@@ -40,6 +41,10 @@ METHODS: dict[str, dict[str, Any]] = {
     "distilled": {"teacher": "ensemble"},
 }
 """Methods by name: wrappers, innermost first, and what differs from one Gaussian network (`train`)."""
+CLASSES_ONLY = ("platt",)
+"""Methods that are for classes only."""
+COVERAGE = 0.8
+"""Share of the most confident test samples whose error is in the tables."""
 TEACHER_WEIGHT, TEACHER_DRAWS = 9.0, 16
 """Weight of the divergence from the teacher, and number of its draws, as in objective=[distillation]."""
 KNOBS = {
@@ -144,8 +149,8 @@ def measure(root: Path, name: str, runs: Sequence[int], methods: Sequence[str]) 
     for run in runs:
         data, batches = load_data(root, name, run)
         for label in methods:
-            if name == "moons" and "head" in METHODS[label]:
-                continue  # these heads are for real numbers
+            if (name == "moons" and "head" in METHODS[label]) or (name != "moons" and label in CLASSES_ONLY):
+                continue  # the heads are for real numbers
             predictor = train(data, batches, METHODS[label], run)
             rows += [
                 {"data": name, "method": label, "run": run, **row} for row in test(predictor, batches, label)
@@ -158,7 +163,10 @@ def test(predictor: Any, batches: dict[str, Any], label: str) -> Iterator[dict[s
     import torch
 
     from framework.distributions.model_mixtures import expected_entropy
+    from framework.prediction import Prediction
     from plugins.metric.out_of_distribution.metric import ranking
+    from plugins.metric.risk_coverage.functional import at_coverage
+    from plugins.metric.risk_coverage.functional import curve as risk_curve
 
     knob, values = KNOBS.get(label, ("", (0,)))
     owner = next((module for module in predictor.modules() if knob and hasattr(module, knob)), None)
@@ -171,6 +179,13 @@ def test(predictor: Any, batches: dict[str, Any], label: str) -> Iterator[dict[s
             torch.manual_seed(0)
             density = predictor(batch["input"])
             row = {"knob": value, "log_likelihood": density.log_prob(batch["target"]).mean().item()}
+            prediction = Prediction(density, batch)
+            if "outliers" in batches:
+                risk = (prediction.point != batch["target"]).double()
+            else:
+                risk = (prediction.point - batch["target"]).abs().mean(-1)
+            row["selected_risk"] = at_coverage(risk_curve(-prediction.entropy, risk), COVERAGE).item()
+            row["risk"] = risk.mean().item()
             if "outliers" in batches:
                 parts = [predictor(batches["outliers"]["input"]), density]
                 entropies = [part.entropy().double() for part in parts]
@@ -206,8 +221,7 @@ def page() -> None:
         "`student_t`, `quantiles`, or `balance 0.5`, which is `gaussian` trained by the β-NLL with β = 0.5. For the "
         "moons, the head is `bernoulli`. `distilled` is one network that learns from the five networks of `ensemble`, "
         "with the divergence of `objective=[distillation]` and its default weight. No setting was tuned for any "
-        "method. With three runs, differences "
-        "below two standard errors mean nothing.",
+        "method. `platt` is for classes only. With three runs, differences below two standard errors mean nothing.",
         "",
         "![Log-likelihood against processor time](uncertainty.png)",
         "",
@@ -235,6 +249,10 @@ def page() -> None:
             *table_of_set(rows, name),
         ]
     lines += [
+        "",
+        f"The last error of a row is that of selective prediction: the {1 - COVERAGE:.0%} of the test samples with the "
+        "largest predictive entropy are left out. A method whose entropy orders its mistakes well has a lower error "
+        "there. It is a mean absolute error in the unit of the table, or for the moons the share of wrong classes.",
         "",
         "The outliers of the moons lie far from both classes, on one side. AUROC is that of the entropy or of the "
         "mutual information of class and model as a score, where there are several models; 0.5 is chance, and 0 says "
@@ -271,6 +289,9 @@ def curve(rows: list[dict[str, Any]], name: str, method: str) -> list[dict[str, 
                 "time": mean(row["microseconds"] for row in part),
                 "auroc": mean(row.get("auroc", math.nan) for row in part),
                 "shared": mean(row.get("mutual_information_auroc", math.nan) for row in part),
+                "risk": mean(row["risk"] for row in part),
+                "selected": mean(row["selected_risk"] for row in part),
+                "selected_error": stdev(row["selected_risk"] for row in part) / root,
             }
         )
     return points
@@ -286,10 +307,13 @@ def table_of_set(rows: list[dict[str, Any]], name: str) -> list[str]:
         last = points[-1]
         gain = f"{last['gain']:+.3f} ± {last['gain_error']:.3f}" if method != "one model" else ""
         cells = [method, f"{last['value']:.3f} ± {last['error']:.3f}", gain, f"{last['time']:.2f}"]
+        cells += [f"{last['risk']:.3f}", f"{last['selected']:.3f} ± {last['selected_error']:.3f}"]
         if name == "moons":
             cells += [f"{last['auroc']:.3f}", "" if math.isnan(last["shared"]) else f"{last['shared']:.3f}"]
         lines.append((last["value"], f"| {' | '.join(cells)} |"))
     columns = ["method", "log-likelihood, nats", "gain over one model, paired", "µs / row"]
+    risk = "error rate" if name == "moons" else "absolute error"
+    columns += [risk, f"{risk}, most confident {COVERAGE:.0%}"]
     columns += ["AUROC, entropy", "AUROC, mutual information"] if name == "moons" else []
     head = [f"| {' | '.join(columns)} |", f"|---|{'---:|' * (len(columns) - 1)}"]
     return [*head, *(line for _, line in sorted(lines, reverse=True))]
