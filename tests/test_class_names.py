@@ -1,12 +1,13 @@
-"""Tests of the comparison of class names: names that look the same are refused, and similar ones are reported."""
+"""Tests of class names and shares: names that look the same are refused, and what may mislead is reported."""
 
 import shutil
 import unicodedata
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from framework.datasets.class_names import compare_classes
+from framework.datasets.class_names import compare_classes, describe_dominant
 from framework.errors import DataError
 from framework.storage.text import INVISIBLE
 from framework.testing.contract import contract
@@ -41,6 +42,42 @@ def test_names_that_differ_in_capital_letters_are_reported() -> None:
     (remark,) = compare_classes(["no", "yes", "No", "no"], "table.csv")
     assert remark.startswith("the classes 'No' and 'no' differ only in capital letters")
     assert compare_classes(["no", "yes", "m2", "m²"], "table.csv") == ()
+
+
+@pytest.mark.parametrize(
+    ("counts", "is_reported"),
+    [((27, 3), True), ((89, 11), False), ((2, 95, 3), True), ((9, 0), False), ((), False)],
+)
+def test_a_class_of_nearly_all_test_samples_is_reported(counts: tuple[int, ...], is_reported: bool) -> None:
+    remarks = describe_dominant(("a", "b", "c"), np.repeat(np.arange(len(counts)), counts))
+    assert len(remarks) == is_reported
+    if is_reported:
+        most = max(counts)
+        assert (
+            f"{most} of {sum(counts)} test samples have the class '{'abc'[counts.index(most)]}'" in remarks[0]
+        )
+        assert f"has the accuracy {most / sum(counts):.4g}." in remarks[0]
+
+
+@pytest.mark.parametrize("name", ["image_folder", "turned_images", "point_cloud_folder", "tabular"])
+def test_data_sets_of_classes_report_a_class_of_nearly_all_test_samples(name: str, tmp_path: Path) -> None:
+    """Repeat the files or rows of one class; images that are turned have no classes to report."""
+    if name == "tabular":
+        file = tmp_path / "rows.csv"
+        rows = [f"{row},{'no' if row % 20 else 'yes'}" for row in range(200)]
+        file.write_text("\n".join(["x,y", *rows]), encoding="utf-8")
+        settings = {"path": str(file), "target": "y", "test": 0.5}
+    else:
+        (row, *_) = contract("data", name).rows
+        assert isinstance(row, DataRow) and row.write is not None
+        settings = {"root": row.write(tmp_path)["root"], "validation": 0.1, "test": 0.1}
+        assert not any("always" in x for x in prepared(name, **settings).remarks)
+        first = min(path for path in tmp_path.iterdir() if path.is_dir())
+        for file in [*first.iterdir()]:
+            for number in range(30):
+                shutil.copy(file, first / f"{file.stem}_{number}{file.suffix}")
+    remarks = prepared(name, **settings).remarks
+    assert any("model that always predicts it" in x for x in remarks) == (name != "turned_images")
 
 
 @pytest.mark.parametrize("name", ["image_folder", "turned_images", "point_cloud_folder"])

@@ -1,11 +1,17 @@
-"""Names of the classes in a user's data: two names that look the same are refused, and similar ones are reported."""
+"""Names and shares of the classes in a user's data: faults are refused, and what may mislead is reported."""
 
 import math
 import unicodedata
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Sequence
+
+import numpy as np
+from jaxtyping import Int
 
 from framework.errors import DataError, quote, shorten
 from framework.storage.text import INVISIBLE, parse_number
+
+DOMINANT = 0.9
+"""Smallest share of one class in the test split at which the share is reported."""
 
 
 def compare_classes(names: Iterable[str], place: str) -> tuple[str, ...]:
@@ -38,6 +44,27 @@ def compare_classes(names: Iterable[str], place: str) -> tuple[str, ...]:
     return (
         f"the classes {shorten(' and '.join(map(quote, similar)))} differ only in capital letters and are different "
         "classes; write them in the same way to make them one class",
+    )
+
+
+def describe_dominant(classes: Sequence[str], tested: Int[np.ndarray, "samples"]) -> tuple[str, ...]:
+    """Return a remark about a class that has at least the share DOMINANT of the test split; () if none has.
+
+    The accuracy is then high for a model that learned nothing, and a prediction set that is right on average may leave
+    out every other class.
+
+    Args:
+        classes: names of the classes.
+        tested: index of the class of each test sample.
+    """
+    counts = np.bincount(tested, minlength=len(classes))
+    most = int(counts.argmax())
+    if len(tested) in (0, counts[most]) or counts[most] < DOMINANT * len(tested):
+        return ()
+    return (
+        f"{counts[most]} of {len(tested)} test samples have the class {quote(classes[most])}: a model that always "
+        f"predicts it has the accuracy {counts[most] / len(tested):.4g}. Compare the accuracy with this number, or "
+        "state what each error costs (metric=[decision_cost])",
     )
 
 

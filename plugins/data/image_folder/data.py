@@ -16,6 +16,7 @@ from torch.utils.data import Dataset
 from framework.configuration.paths import FilePath
 from framework.data import Batch, Data, Splits
 from framework.datasets import given_images, images
+from framework.datasets.class_names import describe_dominant
 from framework.datasets.fields import FetchedInBatches, fetch
 from framework.datasets.new_files import Trained, restore_trained
 from framework.errors import ConfigError
@@ -149,6 +150,7 @@ class ImageFolder(LabelledData):
         self.target = Target("class", loaded.classes)
         self.groups = (self.title,)
         self._splits = Splits(**loaded.splits)
+        self.remarks += describe_dominant(loaded.classes, loaded.tested)
         if self.corruption is not None:
             self._splits = self._splits._replace(
                 test=Corrupted(self._splits.test, self.corruption, self.strength)

@@ -76,6 +76,7 @@ class Loaded(NamedTuple):
         remarks: Clauses about files and columns that are not read.
         digest: Hash of names, classes, splits and, for idx files, pixels.
         own: What a model that is trained on the images stores about them.
+        tested: Index of the class of each test image, also of those that cannot be read.
     """
 
     classes: tuple[str, ...]
@@ -84,6 +85,7 @@ class Loaded(NamedTuple):
     remarks: tuple[str, ...]
     digest: str
     own: Trained
+    tested: NDArray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,7 +232,8 @@ class LabelledImages:
                 digest.update(squares.numpy().tobytes())
         digest.update(repr((listed.names, listed.labels, splits.tolist())).encode())
         own = Trained.on(content, classes, hashes, splits)
-        return Loaded(classes, tables, skipped, (*listed.remarks, *remarks), digest.hexdigest(), own)
+        remarks = (*listed.remarks, *remarks)
+        return Loaded(classes, tables, skipped, remarks, digest.hexdigest(), own, labels[splits == "test"])
 
     @staticmethod
     def _check_splits(

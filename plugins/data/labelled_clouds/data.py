@@ -11,7 +11,7 @@ from pydantic import Field
 
 from framework.configuration.paths import FilePath, Words
 from framework.datasets.class_folders import describe_layouts, list_files
-from framework.datasets.class_names import compare_classes
+from framework.datasets.class_names import compare_classes, describe_dominant
 from framework.datasets.new_files import (
     TestShare,
     Trained,
@@ -247,6 +247,7 @@ class PointCloudFolder(FoldersOfClouds):
                 *describe_unread(readable, self.reading),
                 *describe_tested_share(readable.splits, splits, trained, content, root),
                 *left_out,
+                *describe_dominant(classes, labels[splits == "test"]),
             ),
             needed=("train", "validation", "test") if trained is None else ("test",),
         )

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from framework.data import Splits, as_inputs
 from framework.datasets.angles import unlike_degrees, unlike_radians
-from framework.datasets.class_names import compare_classes
+from framework.datasets.class_names import compare_classes, describe_dominant
 from framework.datasets.csv_columns import (
     ColumnChoice,
     Columns,
@@ -279,6 +279,8 @@ def load(
     if target.kind == "class" and trained is None:
         remarks += compare_classes(target.names, f"{file}, column {question.target[0]!r}")
         remarks += describe_untested(target.names, values[rows], split)
+    if target.kind == "class":
+        remarks += describe_dominant(target.names, encoded[torch.from_numpy(split == 2)].numpy())
     if target.kind == "real" and trained is None:
         remarks += _constant_targets(question.target, values[training])
     scaled = as_float32(cells, columns, rows, standardise(inputs[rows], scaling))
