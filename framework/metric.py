@@ -9,12 +9,16 @@ from torch import Tensor
 
 from framework.prediction import Prediction, Split
 from framework.storage.light_torchmetrics import torchmetrics
+from framework.target import Target
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Directions = dict[str, Literal["higher", "lower"]]
 """Directions in which numbers are better, by the names of the numbers."""
+
+SINGLE = 6
+"""Largest number of target numbers for which `columns_by_number` has a column for each."""
 
 
 class Metric(torchmetrics.Metric, ABC):
@@ -64,6 +68,10 @@ class Metric(torchmetrics.Metric, ABC):
         All scalars are NaN if no batch was seen.
         """
 
+    def remarks(self) -> tuple[str, ...]:
+        """Return sentences without which the results would mislead; logged once after all samples of a test."""
+        return ()
+
 
 class Mean(Metric):
     """Base class of metrics that compute one or more numbers for each sample, and return their mean over all samples.
@@ -98,6 +106,23 @@ class Mean(Metric):
         mean = self.total / self.count
         spread = (self.squares / self.count - mean.square()).clamp(min=0)  # (n - 1)/n of the sample variance
         return mean, (spread / (self.count - 1).clamp(min=0)).sqrt()
+
+
+def columns_by_number(key: str, heading: str, target: Target) -> dict[str, str]:
+    """Return the columns of a result that has the target's unit: `columns` of a metric.
+
+    A real-valued target of 2 to SINGLE numbers has a column `<key>_<name>` for each number behind the column `key` of
+    the mean over all of them, which has no meaning if the numbers have different units.
+
+    Args:
+        key: name of the result over all numbers.
+        heading: heading of its column.
+        target: target of the metric.
+    """
+    if target.kind != "real" or not 1 < len(target.names) <= SINGLE:
+        return {key: heading}
+    single = {f"{key}_{name}": f"{heading} of {name}" for name in target.names}
+    return {key: f"{heading}, all numbers", **single}
 
 
 class HasFigure(ABC):

@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.distributions.checks import refuse_nan
-from framework.metric import Directions, Mean
+from framework.metric import Directions, Mean, columns_by_number
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.crps.score import REPLICATES, crps
@@ -50,9 +50,9 @@ class CRPS(Mean):
         self.samples = samples
         self.unit = "_deg" if target.kind == "angle" else ""
         self.factor = 180 / math.pi if target.kind == "angle" else 1.0
-        if target.kind == "angle":
-            self.columns = {"crps_deg": "CRPS °"}  # pyright: ignore[reportAttributeAccessIssue]
-            self.better = {"crps_deg": "lower"}  # pyright: ignore[reportAttributeAccessIssue]
+        heading = "CRPS °" if target.kind == "angle" else "CRPS"
+        self.columns = columns_by_number(f"crps{self.unit}", heading, target)  # pyright: ignore[reportAttributeAccessIssue]
+        self.better = dict.fromkeys(self.columns, "lower")  # pyright: ignore[reportAttributeAccessIssue]
         self.names = target.names
         self.start(len(self.names) + 1)
         self.add_state("variance", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")

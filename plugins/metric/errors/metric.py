@@ -7,12 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from framework.metric import Directions, Mean
+from framework.metric import Directions, Mean, columns_by_number
 from framework.prediction import Prediction
 from framework.target import Target
-
-FIRST = 6
-"""Largest number of target numbers for which the error of each is reported; for more, only the mean is reported."""
 
 
 class Errors(Mean):
@@ -31,7 +28,9 @@ class Errors(Mean):
     def __init__(self, target: Target) -> None:
         super().__init__()
         target.require("real", by=f"metric {self.key}")
-        self.names = names(self.key, target)
+        self.columns = columns_by_number(self.key, self.columns[self.key], target)  # pyright: ignore[reportAttributeAccessIssue]
+        self.better = dict.fromkeys(self.columns, "lower")  # pyright: ignore[reportAttributeAccessIssue]
+        self.names = [*self.columns]
         self.start(len(self.names))
 
     @abstractmethod
@@ -93,13 +92,3 @@ class RootMeanSquareError(Errors):
         root = mean.sqrt()
         # if all errors are 0, the standard error is 0 too; do not divide by 0
         return root, torch.where(root == 0, error, error / (2 * root))
-
-
-def names(metric: str, target: Target) -> list[str]:
-    """Return the names of the results of a metric.
-
-    The first one is `metric`, the result over all numbers of the target. If the target has 2 to `FIRST` numbers, the
-    names of the results for the single numbers follow.
-    """
-    several = target.names if 1 < len(target.names) <= FIRST else ()
-    return [metric, *(f"{metric}_{name}" for name in several)]
