@@ -21,6 +21,7 @@ from framework.prediction import Prediction, Split
 if TYPE_CHECKING:  # a metric imports torchmetrics, which predictions do not need
     from framework.metric import Metric
 
+_log = logging.getLogger(__name__)
 BLOCK = 64
 """Number of samples that are evaluated at once.
 
@@ -87,7 +88,10 @@ def evaluate(
     all_metrics = [metric for group in (overall, *by_group.values()) for metric in group]
     for number, batch in enumerate(on_device(outliers, device)):
         _update(all_metrics, predictor, batch, samples, Draw(seed, number), "outliers")
-    return Evaluation(numbers(overall), {name: numbers(group) for name, group in by_group.items()}, overall)
+    total = numbers(overall)
+    for remark in (remark for metric in overall for remark in metric.remarks()):
+        _log.warning(remark)
+    return Evaluation(total, {name: numbers(group) for name, group in by_group.items()}, overall)
 
 
 def fresh(metrics: "Sequence[Metric]", device: torch.device) -> "list[Metric]":

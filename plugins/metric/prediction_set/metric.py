@@ -12,6 +12,9 @@ from framework.metric import Directions, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 
+MISSED, ERRORS = 0.05, 4
+"""Smallest difference between stated and found coverage that is reported, also in standard errors."""
+
 
 class PredictionSetMetric(Metric):
     """Coverage and mean size of the predicted sets, and the share of empty sets.
@@ -44,6 +47,7 @@ class PredictionSetMetric(Metric):
             self.key: "set size °" if degrees else "set size",
             "set_empty": "empty sets",
         }
+        self.stated: float | None = None
         self.better = {self.key: "lower"}  # pyright: ignore[reportAttributeAccessIssue]
         for name in ("count", "covered", "size", "empty"):
             self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
@@ -58,6 +62,7 @@ class PredictionSetMetric(Metric):
                 f"{type(prediction.density).__name__}, which has none. Add conformal as the last wrapper, "
                 "uncertainty=[..., conformal], or leave this metric out."
             )
+        self.stated = sets.stated_probability
         size = prediction.set_size(sets)
         broken = (size.isnan() | prediction.log_prob.isnan()).nonzero().flatten()
         if len(broken):
@@ -84,3 +89,16 @@ class PredictionSetMetric(Metric):
             self.key: self.size / self.count,
             "set_empty": self.empty / self.count,
         }
+
+    def remarks(self) -> tuple[str, ...]:
+        results = self.compute()
+        found = float(results["set_coverage"])
+        if self.stated is None or not found < self.stated - MISSED:
+            return ()
+        if self.stated - found < ERRORS * math.sqrt(self.stated * (1 - self.stated) / float(self.count)):
+            return ()
+        return (
+            f"prediction_set: the sets hold {100 * found:.3g} % of the test targets, but {100 * self.stated:.4g} % are "
+            "stated. The test samples differ from the validation samples that set the threshold, as later rows or "
+            "other groups do, or these are few. Do not rely on the sets, nor on the densities, for such samples.",
+        )

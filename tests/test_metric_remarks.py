@@ -1,0 +1,55 @@
+"""Tests of the sentences that a metric adds to its results, `Metric.remarks`."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch.distributions import Categorical
+
+from framework.configuration.schema import build, resolve
+from framework.evaluation.splits import evaluate
+from framework.target import Target
+from framework.testing.plain import LENGTH, Plain
+
+CLASSES = Target("class", ("a", "b", "c"))
+
+conformal = build(
+    "uncertainty", resolve("uncertainty", "conformal"), model=lambda: Plain(CLASSES), target=CLASSES
+)
+PredictionSet: Any = type(conformal(torch.zeros(1, LENGTH)))
+"""Class of the densities with prediction sets that a conformal wrapper returns, as in a run."""
+
+
+@pytest.mark.parametrize(
+    ("inside", "count", "is_reported"),
+    [
+        (32, 100, True),
+        (900, 1000, False),
+        (860, 1000, False),
+        (840, 1000, True),
+        (8, 10, False),
+        (0, 40, True),
+    ],
+)
+@pytest.mark.parametrize("parts", [1, 3])
+def test_a_coverage_far_below_the_stated_one_is_reported_once(
+    inside: int, count: int, parts: int, caplog: pytest.LogCaptureFixture, *, is_reported: bool
+) -> None:
+    """Test sets that hold class 0 and are stated to hold 90 % of the targets; the test split has other shares."""
+    labels = (torch.arange(count) >= inside).long()
+    logits = torch.tensor([4.0, 0.0, 0.0]).double().expand(count, 3)
+    batches = [{"input": part, "target": part.long()} for part in labels.tensor_split(parts)]
+
+    metric = build("metric", resolve("metric", "prediction_set"), target=CLASSES)
+
+    class Sets(torch.nn.Module):
+        def forward(self, inputs: torch.Tensor) -> torch.distributions.Distribution:
+            density = Categorical(logits=logits[: len(inputs)], validate_args=False)
+            return PredictionSet(density, torch.tensor(1.0).double(), "density", 0.9)
+
+    device = torch.device("cpu")
+    evaluate(Sets(), batches, [metric], groups=("all",), samples=1, seed=0, device=device)
+    messages = [record.message for record in caplog.records if "prediction_set" in record.message]
+    assert len(messages) == is_reported
+    if is_reported:
+        assert f"hold {100 * inside / count:.3g} % of the test targets, but 90 % are stated" in messages[0]
