@@ -370,9 +370,9 @@ def page(root: Path) -> None:
         missed(rows),
         "",
         "The worst split is the lowest mean log-likelihood of a split. The time of 20 runs is the wall time of "
-        "the one command that makes them; it makes two runs at a time, with one thread each. Other programs used the "
-        "machine at the same time, so that this time is an upper bound; it is not measured if the command was "
-        "interrupted. Half the processor time of the 20 runs is an estimate of the wall time on two free cores. The "
+        "the one command that makes them; it makes two runs at a time, with one thread each. Other work on the "
+        "machine lengthens this time; it is not measured if the command was interrupted. "
+        "Half the processor time of the 20 runs is an estimate of the wall time on two free cores. The "
         "time of a prediction is the "
         "processor time of a row in a batch of 2000 rows by the frozen model on one thread, a median over "
         f"{TIMED} splits; the last column also includes the point prediction, which is the median of "
