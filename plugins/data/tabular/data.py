@@ -105,7 +105,8 @@ class Tabular(Data):
         self.title = Path(self.path or "").stem
         self.skipped = table.skipped
         names = ", ".join(map(quote, self.question.target))
-        self.remarks = (f"predicted: the column {names}, data.kind={self.question.kind}", *table.remarks)
+        column = "column" if len(self.question.target) == 1 else "columns"
+        self.remarks = (f"predicted: the {column} {names}, data.kind={self.question.kind}", *table.remarks)
 
     @cached_property
     def _table(self) -> Table:

@@ -127,6 +127,11 @@ def report_unknown(unknown: Mapping[str, int], column: str) -> None:
         )
 
 
+def count_levels(cells: Columns, name: str) -> int:
+    """Return the number of different words of a column, without the words that mean a missing cell."""
+    return len(_levels(cells, name))
+
+
 def _levels(cells: Columns, name: str) -> Counter[str]:
     """Return the words of a column that are not missing, with their numbers of rows."""
     return Counter(word for word in cells.cells[name] if word.lower() not in cells.notation.missing)

@@ -37,7 +37,9 @@ from framework.storage import text
 from framework.storage.arrays import to_real
 from framework.target import Target
 from plugins.data.tabular.levels import (
+    MOST_LEVELS,
     add_levels,
+    count_levels,
     expand_words,
     explain_many_levels,
     levels_in_memory,
@@ -230,7 +232,9 @@ def load(
         if question.columns is not None:
             names = [part for name in question.columns for part in levels.get(name, (name,))]
             question = question._replace(columns=tuple(names))
-    choice = _choose_inputs(cells, question) if trained is None else _choose(cells, question, trained.names)
+    choice = (
+        _choose_inputs(cells, question, words) if trained is None else _choose(cells, question, trained.names)
+    )
     if words == "levels":
         choice = choice._replace(left_out=explain_many_levels(cells, choice.left_out))
     columns = choice.names
@@ -509,7 +513,7 @@ def as_float32(
     return torch.from_numpy(narrow)
 
 
-def _choose_inputs(cells: Columns, question: Question) -> ColumnChoice:
+def _choose_inputs(cells: Columns, question: Question, words: WordColumns) -> ColumnChoice:
     """Return the input columns: those that the settings name, or all columns of numbers."""
     if question.columns is not None:
         require(cells, question.columns, "data.columns")
@@ -520,6 +524,8 @@ def _choose_inputs(cells: Columns, question: Question) -> ColumnChoice:
                 f"data.columns names {min(known)!r}, but this column is the target (data.target). Remove it from "
                 "data.columns."
             )
+        for name in columns:
+            _require_numbers(cells, name, words)
         chosen = _choose(cells, question, columns)
     else:
         chosen = numeric_columns(cells, (*question.target, SPLIT, GROUP), "data.columns")
@@ -530,6 +536,33 @@ def _choose_inputs(cells: Columns, question: Question) -> ColumnChoice:
             + "".join(f" {quote(name)}: {why}." for name, why in list(chosen.left_out.items())[:8])
         )
     return chosen
+
+
+def _require_numbers(cells: Columns, name: str, words: WordColumns) -> None:
+    """Raise an error if an input column that the settings name holds words or dates.
+
+    Args:
+        cells: The table.
+        name: Name of the column.
+        words: Setting of the columns of words; with "levels", only columns that it cannot read are still words.
+    """
+    kind = describe_words(cells, name)
+    if not kind:
+        return
+    count = count_levels(cells, name)
+    if kind.startswith("dates"):
+        advice = "Write numbers into the column, such as days since the first date"
+    elif words == "levels" or count > MOST_LEVELS:
+        advice = (
+            f"It has {count} different words, but data.words=levels reads 2 to {MOST_LEVELS}. Give rare words a common "
+            "name"
+        )
+    else:
+        advice = "To read words, set data.words=levels"
+    raise DataError(
+        f"{cells.file}, column {quote(name)}: data.columns names the column, but it holds {kind}, and inputs are "
+        f"numbers. {advice}, or remove the column from data.columns."
+    )
 
 
 def _choose(cells: Columns, question: Question, columns: tuple[str, ...]) -> ColumnChoice:

@@ -393,6 +393,33 @@ def test_remarks_name_the_target_and_the_columns_that_are_left_out(tmp_path: Pat
     )
 
 
+@pytest.mark.parametrize(
+    ("form", "words", "advice"),
+    [
+        ("2024-01-{0:02d}", "leave_out", r"holds dates such as '2024-01-01', .* days since the first date"),
+        ("2024-{1:02d}-{0:02d}", "levels", r"holds dates such as '2024-00-01', .* days since the first date"),
+        ("w{0}", "leave_out", r"holds words such as 'w1', .* To read words, set data\.words=levels"),
+        ("w{0}", "levels", ""),
+        ("w{0}_{1}", "leave_out", r"It has 80 different words, but data\.words=levels reads 2 to 50"),
+        ("w{0}_{1}", "levels", r"It has 80 different words, but data\.words=levels reads 2 to 50"),
+        ("same", "levels", r"It has 1 different words, but data\.words=levels reads 2 to 50"),
+        ("{0}.5", "leave_out", ""),
+    ],
+)
+def test_named_columns_that_hold_no_numbers_are_refused_with_what_helps(
+    tmp_path: Path, form: str, words: str, advice: str
+) -> None:
+    file = tmp_path / "mine.csv"
+    rows = [f"{form.format(row % 9 + 1, row)},{row / 4},{row}" for row in range(80)]
+    file.write_text("\n".join(["named,x,y", *rows]), encoding="utf-8")
+    settings = {"target": "y", "kind": "real", "words": words}
+    if advice:
+        with pytest.raises(DataError, match=rf"mine\.csv, column 'named': data\.columns names .*{advice}"):
+            prepare_data(file, columns=["named", "x"], **settings)
+    else:
+        assert len(prepare_data(file, columns=["named", "x"], **settings).columns) >= 2
+
+
 def test_settings_that_do_not_fit_the_table_are_refused(tmp_path: Path) -> None:
     file = table(tmp_path)
     with pytest.raises(
@@ -401,7 +428,9 @@ def test_settings_that_do_not_fit_the_table_are_refused(tmp_path: Path) -> None:
         prepare_data(file, columns=["nomber"])
     with pytest.raises(DataError, match=r"data\.columns names 'class', but this column is the target"):
         prepare_data(file, columns=["number", "class"])
-    with pytest.raises(DataError, match=r"line 2, column 'word': 'a' is not a finite number"):
+    with pytest.raises(
+        DataError, match=r"'word': .* holds words such as 'a', .* set data\.words=levels, or remove"
+    ):
         prepare_data(file, columns=["word"])
     with pytest.raises(
         DataError, match=r"'class': The column holds words such as 'cat', .*experiment=tabular/classification"
