@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 import torch
-from torch.distributions import Categorical
+from torch.distributions import Categorical, Independent, Normal
 
 from framework.configuration.schema import build, resolve
 from framework.evaluation.splits import evaluate
@@ -53,3 +53,36 @@ def test_a_coverage_far_below_the_stated_one_is_reported_once(
     assert len(messages) == is_reported
     if is_reported:
         assert f"hold {100 * inside / count:.3g} % of the test targets, but 90 % are stated" in messages[0]
+
+
+@pytest.mark.parametrize("name", ["log_likelihood", "nll"])
+@pytest.mark.parametrize("groups", [("all",), ("even", "odd")])
+@pytest.mark.parametrize("outliers", [{}, {7: 9.0}, {7: 9.0, 90: -40.0, 130: 8.0}])
+def test_nearly_impossible_targets_are_counted_once_over_all_batches_and_groups(
+    name: str, groups: tuple[str, ...], outliers: dict[int, float], caplog: pytest.LogCaptureFixture
+) -> None:
+    target = torch.zeros(150, 1, dtype=torch.float64)
+    for index, value in outliers.items():
+        target[index] = value
+    index = torch.arange(len(target))
+    fields = {"input": target, "target": target, "index": index, "group": index % len(groups)}
+    batches = [
+        dict(zip(fields, parts, strict=True))
+        for parts in zip(*(field.split(64) for field in fields.values()), strict=True)
+    ]
+
+    class StandardNormal(torch.nn.Module):
+        def forward(self, inputs: torch.Tensor) -> torch.distributions.Distribution:
+            return Independent(Normal(torch.zeros_like(inputs), 1.0), 1)
+
+    metric = build("metric", resolve("metric", name), target=Target("real", ("y",)))
+    for _ in range(2):  # a second test of the same metrics counts anew
+        caplog.clear()
+        device = torch.device("cpu")
+        evaluate(StandardNormal(), batches, [metric], groups=groups, samples=1, seed=0, device=device)
+        messages = [record.message for record in caplog.records if "nats less likely" in record.message]
+        assert len(messages) == bool(outliers)
+        if outliers:
+            worst, value = max(outliers.items(), key=lambda item: abs(item[1]))
+            assert f"{len(outliers)} of 150 targets" in messages[0]
+            assert f"is test sample {worst}, target {value:g}, with" in messages[0]

@@ -1,7 +1,6 @@
 """Mean log-likelihood or its negative, with the standard error, from a running mean and sum of squared deviations."""
 
-import logging
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -14,15 +13,33 @@ from framework.metric import Directions, Metric
 from framework.prediction import Prediction
 
 UNLIKELY = 20.0
-"""Number of nats below the median log-likelihood at which a target is reported."""
-_log = logging.getLogger(__name__)
+"""Number of nats below the median log-likelihood of its batch at which a target is reported."""
+
+
+class Unlikely(NamedTuple):
+    """Targets that are nearly impossible according to their predicted densities.
+
+    Attributes:
+        count: number of these targets.
+        samples: number of all targets.
+        lowest: lowest log-likelihood, nats.
+        index: number of this sample in the split.
+        target: its target, in the user's unit.
+    """
+
+    count: int = 0
+    samples: int = 0
+    lowest: float = 0.0
+    index: int = 0
+    target: str = ""
 
 
 class Moments(Metric):
     """Base class of the metrics of log-likelihood.
 
     The states are the moments of the log-likelihoods (`compute_moments`), and sums from which the sampling error is
-    computed (`summarize_sampling`).
+    computed (`summarize_sampling`). A remark counts real-valued targets that are more than UNLIKELY nats less likely
+    than the median of their batch, because a few such samples dominate the mean.
     """
 
     moments: Tensor
@@ -33,6 +50,23 @@ class Moments(Metric):
         # a single state, because count, mean and squared deviations can only be merged together
         self.add_state("moments", torch.zeros(3, dtype=torch.float64), dist_reduce_fx=merge_moments)
         self.add_state("sampling", torch.zeros(5, dtype=torch.float64), dist_reduce_fx=merge_sampling)
+        self.unlikely = Unlikely()
+
+    def reset(self) -> None:
+        super().reset()
+        self.unlikely = Unlikely()
+
+    def remarks(self) -> tuple[str, ...]:
+        found = self.unlikely
+        if found.count == 0:
+            return ()
+        return (
+            f"log-likelihood: {found.count} of {found.samples} targets are more than {UNLIKELY:g} nats less likely "
+            f"than the median; the least likely is test sample {found.index}, target {found.target}, with "
+            f"{found.lowest:.4g} nats. Its predicted density is far too narrow, or the target is wrong. Such losses "
+            "are bounded by heavier tails (density_head=student_t), by calibration (uncertainty=[folds]) and, for a "
+            "target of several powers of ten, by predicting its logarithm.",
+        )
 
     def add_samples(self, log_prob: Float[Tensor, "batch"], estimate: Estimate) -> None:
         """Add the log-likelihoods of a batch to the states, and the sampling errors in `estimate`."""
@@ -59,7 +93,7 @@ class LogLikelihood(Moments):
 
     def update(self, prediction: Prediction) -> None:
         self.add_samples(prediction.log_prob, prediction.estimate)
-        warn_of_unlikely(prediction)
+        self.unlikely = add_unlikely(self.unlikely, prediction)
 
     def compute(self) -> dict[str, Tensor]:
         return summary("log_likelihood", self.moments, self.sampling)
@@ -83,7 +117,7 @@ class NegativeLogLikelihood(Moments):
         self.add_samples(
             refuse_nan(prediction.log_prob, "log-likelihoods of the targets"), prediction.estimate
         )
-        warn_of_unlikely(prediction)
+        self.unlikely = add_unlikely(self.unlikely, prediction)
 
     def compute(self) -> dict[str, Tensor]:
         results = summary("nll", self.moments, self.sampling)
@@ -91,30 +125,20 @@ class NegativeLogLikelihood(Moments):
         return results | {name: 0 - results[name] for name in ("nll", "nll_debiased") if name in results}
 
 
-def warn_of_unlikely(prediction: Prediction) -> None:
-    """Log a warning if real-valued targets are more than UNLIKELY nats less likely than the median of their batch.
-
-    Otherwise the mean log-likelihood would hide that a few samples dominate it.
-    """
+def add_unlikely(unlikely: Unlikely, prediction: Prediction) -> Unlikely:
+    """Return `unlikely` with the targets of a batch; other targets than real numbers of the test split are ignored."""
     log_prob = prediction.log_prob.detach()
     if len(log_prob) == 0 or prediction.split != "test" or prediction.target.dim() != 2:
-        return
-    below = log_prob < log_prob.median() - UNLIKELY
-    if not bool(below.any()):
-        return
+        return unlikely
+    count = unlikely.count + int((log_prob < log_prob.median() - UNLIKELY).sum())
+    samples = unlikely.samples + len(log_prob)
     row = int(log_prob.argmin())
+    lowest = float(log_prob[row])
+    if count == unlikely.count or (unlikely.count and lowest >= unlikely.lowest):
+        return unlikely._replace(count=count, samples=samples)
     index = prediction.batch["index"][row] if "index" in prediction.batch else row
-    _log.warning(
-        "log-likelihood: %d of %d targets are more than %g nats less likely than the median; the least likely is test "
-        "sample %d, target %s, with %.4g nats. Its predicted density is far too narrow, or the target is wrong. A "
-        "density with heavier tails (density_head=student_t) or calibration (uncertainty=[folds]) bounds such losses.",
-        int(below.sum()),
-        len(below),
-        UNLIKELY,
-        int(index),
-        shorten(", ".join(f"{value:.4g}" for value in prediction.target[row].tolist()), 80),
-        float(log_prob[row]),
-    )
+    target = shorten(", ".join(f"{value:.4g}" for value in prediction.target[row].tolist()), 80)
+    return Unlikely(count, samples, lowest, int(index), target)
 
 
 def summary(
