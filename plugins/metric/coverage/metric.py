@@ -28,7 +28,7 @@ class Coverage(Metric, HasFigure):
     Let h be the probability of all values whose density is at least that of the target. If the predicted densities are
     the true ones, h is uniform on [0, 1]. This holds for classes, real numbers, angles and rotations.
 
-    - `coverage_50`, `coverage_90`: share of targets within the regions of mass 0.5 and 0.9.
+    - `coverage_50`, `coverage_90`: share of targets within the regions of mass 0.5 and 0.9, with standard errors.
     - `coverage_error`: mean |share - mass| over the masses 0.05, 0.10, ..., 0.95.
     - `region_90_labels`, `region_90_deg` or `region_90` (in the unit of the target): mean size of the region of mass
       0.9, for classes, one angle and one real number. Of two models with the right coverage, the one with smaller
@@ -58,6 +58,7 @@ class Coverage(Metric, HasFigure):
     figure_name: ClassVar[str] = "coverage"
     count: Tensor
     inside: Tensor
+    squares: Tensor
     size: Tensor
 
     def __init__(self, target: Target, *, samples: Annotated[int, Field(ge=20, le=10**6)] = 200) -> None:
@@ -72,7 +73,8 @@ class Coverage(Metric, HasFigure):
         elif target.kind == "angle":
             self.unit, self.factor = "region_90_deg", 180 / math.pi
         self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("inside", torch.zeros(LEVELS, dtype=torch.float64), dist_reduce_fx="sum")
+        for name in ("inside", "squares"):
+            self.add_state(name, torch.zeros(LEVELS, dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("size", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
 
     def update(self, prediction: Prediction) -> None:
@@ -82,14 +84,20 @@ class Coverage(Metric, HasFigure):
         result = border(prediction.density, target, REGION, self.samples)
         refuse_nan(result.low + result.high, "masses of regions")
         self.count += len(target)
-        self.inside += coverage_probability(result.low, result.high, self._levels()).sum(0)
+        inside = coverage_probability(result.low, result.high, self._levels())
+        self.inside += inside.sum(0)
+        self.squares += inside.square().sum(0)
         self.size += self.factor * result.size.sum()
 
     def compute(self) -> dict[str, Tensor]:
         share = self.inside / self.count
+        spread = (self.squares / self.count - share.square()).clamp(min=0)
+        error = (spread / (self.count - 1).clamp(min=0)).sqrt()
         results = {
             "coverage_50": share[9],
+            "coverage_50_sem": error[9],
             "coverage_90": share[17],
+            "coverage_90_sem": error[17],
             "coverage_error": (share - self._levels()).abs().mean(),
         }
         return results if self.unit is None else results | {self.unit: self.size / self.count}

@@ -25,7 +25,7 @@ from plugins.metric.decision_cost.functional import (
 class DecisionCost(Metric):
     """Mean cost of the action with the lowest expected cost under each density (Savage 1954; Berger 1985, §1.3).
 
-    - `decision_cost`: mean cost of these actions under the true target.
+    - `decision_cost`: mean cost of these actions under the true target, with its standard error.
     - `decision_cost_fixed`: mean cost of the best constant decision, which chooses the same action for all samples.
     - `decision_cost_oracle`: mean cost if the action that is best for the true class or region were always chosen.
     - `share_<action>`: share of samples for which the action was chosen.
@@ -64,6 +64,7 @@ class DecisionCost(Metric):
     edges: Tensor
     count: Tensor
     total: Tensor
+    squares: Tensor
     fixed: Tensor
     oracle: Tensor
     action_counts: Tensor
@@ -99,6 +100,7 @@ class DecisionCost(Metric):
         )
         self.add_state("count", zero, dist_reduce_fx="sum")
         self.add_state("total", zero.clone(), dist_reduce_fx="sum")
+        self.add_state("squares", zero.clone(), dist_reduce_fx="sum")
         self.add_state("oracle", zero.clone(), dist_reduce_fx="sum")
         self.add_state("fixed", per_action, dist_reduce_fx="sum")
         self.add_state("action_counts", per_action.clone(), dist_reduce_fx="sum")
@@ -117,14 +119,19 @@ class DecisionCost(Metric):
         chosen = decide(expected_costs(probability, self.costs))
         paid = self.costs[truth]  # (batch, action)
         self.count += len(truth)
-        self.total += paid.gather(-1, chosen.unsqueeze(-1)).sum()
+        cost = paid.gather(-1, chosen.unsqueeze(-1))
+        self.total += cost.sum()
+        self.squares += cost.square().sum()
         self.action_counts += torch.nn.functional.one_hot(chosen, len(self.actions)).double().sum(0)
         self.fixed += paid.sum(0)
         self.oracle += paid.amin(-1).sum()
 
     def compute(self) -> dict[str, Tensor]:
+        mean = self.total / self.count
+        spread = (self.squares / self.count - mean.square()).clamp(min=0)
         results = {
-            "decision_cost": self.total / self.count,
+            "decision_cost": mean,
+            "decision_cost_sem": (spread / (self.count - 1).clamp(min=0)).sqrt(),
             "decision_cost_fixed": (self.fixed / self.count).amin(),
             "decision_cost_oracle": self.oracle / self.count,
         }

@@ -17,12 +17,13 @@ MISSED, ERRORS = 0.05, 4
 
 
 class PredictionSetMetric(Metric):
-    """Coverage and mean size of the predicted sets, and the share of empty sets.
+    """Coverage and mean size of the predicted sets, and the share of empty sets, with their standard errors.
 
-    - `set_coverage`: share of targets in their sets, with its standard error; best: the stated probability.
+    - `set_coverage`: share of targets in their sets; best: the stated probability.
     - `set_size`: mean size of the sets. It is the number of labels for classes, the length or volume in the target's
       unit for real numbers, and the volume in radⁿ for n > 1 angles. For one angle, the result is `set_size_deg`, the
-      mean length of the arcs in degrees. The mean size is infinite if a set is unbounded.
+      mean length of the arcs in degrees. The mean size is infinite if a set is unbounded, and its standard error is
+      then NaN.
     - `set_empty`: share of empty sets. An empty set shows that the input is unlike the calibration data.
 
     Raises:
@@ -35,6 +36,7 @@ class PredictionSetMetric(Metric):
     count: Tensor
     covered: Tensor
     size: Tensor
+    squares: Tensor
     empty: Tensor
 
     def __init__(self, target: Target) -> None:
@@ -49,7 +51,7 @@ class PredictionSetMetric(Metric):
         }
         self.stated: float | None = None
         self.better = {self.key: "lower"}  # pyright: ignore[reportAttributeAccessIssue]
-        for name in ("count", "covered", "size", "empty"):
+        for name in ("count", "covered", "size", "squares", "empty"):
             self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
 
     def update(self, prediction: Prediction) -> None:
@@ -76,18 +78,24 @@ class PredictionSetMetric(Metric):
         self.count += len(size)
         self.covered += sets.contains(prediction.target).sum()
         self.size += self.unit * size.sum()
+        self.squares += (self.unit * size).square().sum()
         self.empty += sets.empty().sum()
 
     def compute(self) -> dict[str, Tensor]:
-        coverage = self.covered / self.count
+        coverage, size, empty = (total / self.count for total in (self.covered, self.size, self.empty))
+        # The variance is the mean square minus the square of the mean; the squares of 0 and 1 are 0 and 1.
+        mean_squares = (coverage, self.squares / self.count, empty)
+        coverage_error, size_error, empty_error = (
+            ((square - mean.square()).clamp(min=0) / (self.count - 1).clamp(min=0)).sqrt()
+            for mean, square in zip((coverage, size, empty), mean_squares, strict=True)
+        )
         return {
             "set_coverage": coverage,
-            # the standard error of a share p of n is sqrt(p (1 - p) / (n - 1)); its square is unbiased
-            "set_coverage_sem": (coverage * (1 - coverage) / (self.count - 1)).sqrt()
-            if self.count > 1
-            else coverage.new_tensor(math.nan),
-            self.key: self.size / self.count,
-            "set_empty": self.empty / self.count,
+            "set_coverage_sem": coverage_error,
+            self.key: size,
+            f"{self.key}_sem": size_error,
+            "set_empty": empty,
+            "set_empty_sem": empty_error,
         }
 
     def remarks(self) -> tuple[str, ...]:

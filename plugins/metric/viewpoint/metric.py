@@ -21,7 +21,7 @@ class Viewpoint(Metric):
 
     Both use the distance Δ(R₁, R₂) = ||log(R₁ᵀR₂)||_F / √2 between the rotation matrices of the true and the predicted
     viewpoint (Tulsiani & Malik 2015; thesis Table 3.3). The median of an even number of errors is the mean of the
-    middle two.
+    middle two. The share is returned with its standard error.
 
     Raises:
         ConfigError: the target does not consist of the angles azimuth, elevation and tilt.
@@ -52,8 +52,11 @@ class Viewpoint(Metric):
 
     def compute(self) -> dict[str, Tensor]:
         errors = dim_zero_cat(self.errors) if len(self.errors) else torch.empty(0, dtype=torch.float64)
+        share = (errors < math.pi / 6).double().mean()
         return {
-            "acc_pi_6": (errors < math.pi / 6).double().mean(),
+            "acc_pi_6": share,
+            # the standard error of a share p of n is sqrt(p (1 - p) / (n - 1)); it is undefined for one sample: 0/0
+            "acc_pi_6_sem": (share * (1 - share) / torch.tensor(max(len(errors) - 1, 0))).sqrt(),
             "mederr_deg": _median(errors) * (180 / math.pi),
         }
 
