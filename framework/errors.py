@@ -99,6 +99,16 @@ LISTED_WHOLE, LISTED = 24, 8
 """Largest number of names that a message lists in full, and the number of names that it lists if there are more."""
 
 
+def count_of(number: int, noun: str) -> str:
+    """Return a number with its noun in the singular or plural, such as "1 file" or "3 test files".
+
+    Args:
+        number: the number.
+        noun: the noun in the singular, which takes an "s" in the plural; words may stand before it.
+    """
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
 def nearest_name(word: str, known: Iterable[str], likeness: float = LEAST_SIMILARITY) -> str | None:
     """Return the name most similar to `word`, or None if no name is similar.
 

@@ -3,13 +3,14 @@
 import pickle
 import re
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
 from torch.utils.data import DataLoader, Dataset
 
 from framework import errors
-from framework.errors import CheckpointError, ConfigError, DataError, NonFiniteLoss, UserError
+from framework.errors import CheckpointError, ConfigError, DataError, NonFiniteLoss, UserError, count_of
 
 
 class OfAPlugin(DataError):
@@ -120,3 +121,19 @@ def test_any_other_text_is_kept(kind: type[UserError], said: str) -> None:
     assert str(kind(said)) == str(pickle.loads(pickle.dumps(kind(said)))) == said
     assert kind(said, 3).args == (said, 3)
     assert not re.search(".", str(kind()))
+
+
+@pytest.mark.parametrize(
+    ("number", "expected"), [(0, "0 files"), (1, "1 file"), (2, "2 files"), (1000, "1000 files")]
+)
+def test_a_count_has_a_noun_in_the_right_number(number: int, expected: str) -> None:
+    assert count_of(number, "file") == expected
+
+
+def test_remarks_on_what_is_left_out_have_their_nouns_from_one_function() -> None:
+    """A remark such as "left out: {count} files" would say "1 files"."""
+    root = Path(__file__).parents[1]
+    remark = re.compile(r'"left out[^"{]*: \{(?!count_of)[^}"]*\} (?:\w+ )?\w+s\b')
+    sources = [file for folder in ("framework", "plugins") for file in (root / folder).rglob("*.py")]
+    wrong = [str(file) for file in sources if remark.search(file.read_text(encoding="utf-8"))]
+    assert not wrong, f"{wrong} write a noun in the plural behind a count. Use framework.errors.count_of."

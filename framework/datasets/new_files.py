@@ -11,7 +11,7 @@ from jaxtyping import Bool, Int
 from numpy.typing import NDArray
 from pydantic import Field
 
-from framework.errors import DataError, did_you_mean, quote, shorten
+from framework.errors import DataError, count_of, did_you_mean, quote, shorten
 from framework.storage.reading import open_regular
 
 TestShare = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
@@ -176,7 +176,9 @@ def leave_out_trained(
                 f"{source}: The model was trained on each of the {int(left_out.sum())} files that are to be tested. "
                 "Give files that it was not trained on."
             )
-        remarks = (f"left out of the test: {int(left_out.sum())} files that the model was trained on",)
+        remarks = (
+            f"left out of the test: {count_of(int(left_out.sum()), 'file')} that the model was trained on",
+        )
     if remaining := int((known & ~left_out).sum()):
         remarks += (
             f"{remaining} of the {int((splits == 'test').sum())} test files have the content of files for training or "

@@ -26,7 +26,7 @@ from framework.distributions.affine import AffineDensity
 from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.description import CategoricalDensity
 from framework.distributions.protocol import median
-from framework.errors import ConfigError
+from framework.errors import ConfigError, count_of
 from framework.model import FrozenFrontEnd, Model, Predictor
 
 
@@ -192,7 +192,7 @@ class Frozen:
             count = use_onnx(self.inner, shape, dtype)
             name = type(self.inner.head if isinstance(self.inner, Model) else self.inner).__name__
             self.form = (
-                f"{count} network{'s' * (count > 1)} in ONNX Runtime, then {name} in torch"
+                f"{count_of(count, 'network')} in ONNX Runtime, then {name} in torch"
                 if count
                 else f"{type(self.inner).__name__} in torch, without gradient"
             )

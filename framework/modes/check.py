@@ -16,7 +16,7 @@ from framework.configuration.config import Config, Options
 from framework.configuration.registry import load
 from framework.configuration.settings import Settings
 from framework.configuration.signature import untyped
-from framework.errors import ConfigError, UserError
+from framework.errors import ConfigError, UserError, count_of
 from framework.reports.table import write_csv
 from framework.storage.log_messages import log_each_message_once
 from framework.storage.progress import PlainConsole
@@ -159,7 +159,7 @@ def _line(plugin: Contract, row: Row, finding: Finding) -> dict[str, object]:
 
 def _report(plugin: Contract, worst: Mapping[str, tuple[Row, Finding]], seconds: float) -> Group:
     """Return the table of all properties, and below it the case of each failure and what was not checked."""
-    count = f"{len(plugin.rows)} row{'s' if len(plugin.rows) > 1 else ''}"
+    count = count_of(len(plugin.rows), "row")
     title = f"{plugin.group} {plugin.name}: {count}, {seconds:.1f} s"
     table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left")
     table.add_column("property", overflow="fold")

@@ -14,7 +14,7 @@ from framework.configuration.paths import flatten
 from framework.configuration.registry import load
 from framework.configuration.schema import resolve
 from framework.data import Data
-from framework.errors import CheckpointError, ConfigError
+from framework.errors import CheckpointError, ConfigError, count_of
 from framework.model import FrozenFrontEnd, Predictor
 from framework.reports.report import report_test
 from framework.runs.job import find_members
@@ -59,7 +59,7 @@ def run(config: Config) -> None:
         session.record(run)
         calibrate(session)
         session.save_model(run)
-        console.print(f"{len(members)} members: {', '.join(map(str, sources))}", soft_wrap=True)
+        console.print(f"{count_of(len(members), 'member')}: {', '.join(map(str, sources))}", soft_wrap=True)
         report_test(run, session)
 
 

@@ -22,7 +22,7 @@ from framework.configuration.schema import build, resolve
 from framework.data import Data
 from framework.datasets.shards import INDEX, Shards, is_folder_of_shards, open_shards, part_name
 from framework.encoder import Encoder, FitsInputs
-from framework.errors import ConfigError, DataError, quote
+from framework.errors import ConfigError, DataError, count_of, quote
 from framework.geometry.clouds import pad
 from framework.runs.introduction import introduce_threads, print_lines
 from framework.runs.job import refuse_idle
@@ -209,12 +209,14 @@ def describe_work(collection: Collection, parts: Mapping[str, Any], count: int) 
     """Return the lines about the samples that are read, the encoders, and the `count` parts that this job writes."""
     source = collection.source
     if isinstance(source, Files):
-        reads = f"reads {source.samples} files in {source.root} as {parts['data']['name']}"
+        reads = f"reads {count_of(source.samples, 'file')} in {source.root} as {parts['data']['name']}"
     else:
-        reads = f"reads {source.samples} samples in the shards of {source.folder}"
+        reads = f"reads {count_of(source.samples, 'sample')} in the shards of {source.folder}"
     names = ", ".join(part["name"] for part in parts["encoder"])
     task = f"encodes them by {names}" if names else "packs them into shards"
-    of_job = f"{count} of {collection.parts} parts, with up to {source.part} samples each"
+    of_job = (
+        f"{count} of {count_of(collection.parts, 'part')}, with up to {count_of(source.part, 'sample')} each"
+    )
     return [reads, f"{task}, and writes {of_job}, to {collection.into}"]
 
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from framework.configuration.config import Config, Options
-from framework.errors import ConfigError, UserError
+from framework.errors import ConfigError, UserError, count_of
 from framework.runs.job import find_job_folders
 from framework.storage.progress import PlainConsole
 from framework.tracking.ended import sync
@@ -37,7 +37,7 @@ def run(config: Config) -> None:
         except UserError as error:
             errors.append(error)
         else:
-            PlainConsole().print(f"{lines} journal lines sent from {run}.")
+            PlainConsole().print(f"{count_of(lines, 'journal line')} sent from {run}.")
     if len(errors) == 1:
         raise errors[0]
     if errors:

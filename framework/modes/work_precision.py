@@ -10,7 +10,7 @@ from framework.configuration.modes import idle_sentence
 from framework.configuration.settings import Positive
 from framework.data import Batch
 from framework.density_head import DensityHead
-from framework.errors import ConfigError, did_you_mean
+from framework.errors import ConfigError, count_of, did_you_mean
 from framework.evaluation import reference
 from framework.evaluation.splits import on_device
 from framework.evaluation.tradeoff import first_knob, knob_owners, rows, tradeoff
@@ -110,7 +110,9 @@ def _measure(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
     for key in better:
         columns[f"{key}_pareto"] = "Pareto" if len(better) == 1 else f"Pareto: {headings[key]}"
     console = session.console
-    console.print(results_table(table_rows, columns, title=f"{session.title}, {curve.samples} test samples"))
+    console.print(
+        results_table(table_rows, columns, title=f"{session.title}, {count_of(curve.samples, 'test sample')}")
+    )
     console.print("\n".join(map(str, [path, *figures])), soft_wrap=True, highlight=False)
 
 

@@ -10,6 +10,7 @@ from jaxtyping import UInt8
 from rich.console import Console
 from torch import Tensor
 
+from framework.errors import count_of
 from framework.evaluation.cost import Cost
 from framework.evaluation.rendering import Frame
 from framework.evaluation.splits import Evaluation
@@ -113,7 +114,7 @@ def report_frames(run: Run, rendered: RenderResults, files: Sequence[str], conso
         ),
     ]
     title = f"{rendered.data} · {rendered.method}"
-    frames = f"{rendered.shown.count} frame{'s' * (rendered.shown.count > 1)}"
+    frames = count_of(rendered.shown.count, "frame")
     headings = {"method": "renderer", **columns, **COST_COLUMNS, **HEADINGS}
     console.print(results_table(rows, headings, title=f"{title}, {frames}"))
     if run.settings.pictures:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from framework.configuration.paths import shell_arguments
-from framework.errors import UserError
+from framework.errors import UserError, count_of
 from framework.evaluation.cost import REPEATS, SHORT_TEST_REPEATS, Cost
 from framework.evaluation.splits import Evaluation, cost, evaluate
 from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, machine, results_table
@@ -65,7 +65,7 @@ def report_test(run: Run, session: Session) -> None:
         results,
         *({**results, **numbers, "method": f"  {name}"} for name, numbers in evaluation.groups.items()),
     ]
-    title = f"{session.title}, {len(loader.dataset)} test samples"  # type: ignore[arg-type]
+    title = f"{session.title}, {count_of(len(loader.dataset), 'test sample')}"  # type: ignore[arg-type]
     session.console.print(results_table(rows, {"method": "method", **columns, **COST_COLUMNS}, title=title))
     if settings.pictures:
         _save_pictures(run, session, evaluation, synthetic)

@@ -17,7 +17,7 @@ from framework.configuration.loading import fill, predictor_weights
 from framework.configuration.settings import TRAINER_OURS, CallbackSettings, Settings, device_of
 from framework.data import Batch, Data
 from framework.encoder import ChecksTraining, FitsInputs
-from framework.errors import ConfigError
+from framework.errors import ConfigError, count_of
 from framework.model import FrozenFrontEnd, Model, fitted_models, learns
 from framework.runs.job import PRUNED, RECORD
 from framework.runs.resuming import begin_again, blame_checkpoint, resume_arguments
@@ -324,7 +324,8 @@ def _cache_features(session: Session) -> Data:
     count = cached.compute()
     seconds = time.perf_counter() - start
     session.console.print(
-        f"features of {count} samples computed once in {seconds:.1f} s ({1e3 * seconds / max(1, count):.2g} ms each)"
+        f"features of {count_of(count, 'sample')} computed once in {seconds:.1f} s "
+        f"({1e3 * seconds / max(1, count):.2g} ms each)"
     )
     return cached
 

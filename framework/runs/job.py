@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from framework.errors import ConfigError, DataError, quote
+from framework.errors import ConfigError, DataError, count_of, quote
 from framework.storage.enclosed import require_enclosed
 from framework.storage.files import write_whole
 from framework.storage.first_rank import first_rank
@@ -101,7 +101,7 @@ def find_members(members: str | Sequence[str]) -> list[str | Path]:
         listed = [*(runs or (job for job in find_job_folders(folder) if (job / _MODEL).is_file()))]
     if len(listed) < 2:
         raise ConfigError(
-            f"mode.members = {members!r} names {len(listed)} trained model{'' if len(listed) == 1 else 's'}, but at "
+            f"mode.members = {members!r} names {count_of(len(listed), 'trained model')}, but at "
             "least two are required. Give the folder of a sweep (outputs/sweeps/<time>), or a list of run folders, "
             "checkpoint files or MLflow run ids."
         )

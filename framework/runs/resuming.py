@@ -23,7 +23,7 @@ from framework.configuration.config import Config
 from framework.configuration.paths import flatten, paths_of, require_repeated, shell_arguments
 from framework.configuration.registry import plugin_line
 from framework.configuration.settings import Settings
-from framework.errors import CheckpointError, ConfigError, UserError, shorten
+from framework.errors import CheckpointError, ConfigError, UserError, count_of, shorten
 from framework.runs import provenance
 from framework.storage.first_rank import first_rank
 from framework.storage.old_versions import can_resume_from_best
@@ -72,7 +72,7 @@ def send_rest(folder: Path, store: str | None) -> bool:
     sent = sync(folder, store)
     if sent:
         sys.stdout.write(
-            f"The run had already finished; {sent} journal lines that were missing in its store were sent.\n"
+            f"The run had already finished; sent to its store, which lacked them: {count_of(sent, 'journal line')}.\n"
         )
     return sent > 0
 

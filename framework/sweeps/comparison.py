@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from framework.configuration.modes import MODES
 from framework.configuration.paths import flatten
 from framework.configuration.settings import store_experiment
-from framework.errors import UserError
+from framework.errors import UserError, count_of
 from framework.reports.table import markdown, results_table, write_csv
 from framework.runs.job import find_job_folders, find_members, read_record
 from framework.runs.resuming import stored_config
@@ -89,7 +89,7 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]], config: Mapping[
     if compared:
         from framework.sweeps.pages import failed_jobs, save_report
 
-        title = f"{len(compared.runs)} runs in {folder}"
+        title = f"{count_of(len(compared.runs), 'run')} in {folder}"
         better, columns = compared.better, compared.columns
         console.print(results_table(compared.rows, columns, title=title, better=better))
         write_csv(compared.rows, columns, folder / "comparison.csv")
@@ -101,7 +101,7 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]], config: Mapping[
         files += report
         varied = ", ".join(compared.varied) or "nothing"
         table = markdown(compared.rows, columns, better=better)
-        summary = f"{len(compared.runs)} runs over {varied}.\n\n{table}"
+        summary = f"{count_of(len(compared.runs), 'run')} over {varied}.\n\n{table}"
     close_parent(folder, files, summary, config)
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from framework.errors import ConfigError, UserError
+from framework.errors import ConfigError, UserError, count_of
 from framework.runs.job import PARENT, PRUNED, RECORD, VALUE, find_job_folders, read_record
 from framework.storage.enclosed import read_plain, read_stream
 from framework.storage.files import try_lock, warn_unlocked, write_whole
@@ -215,8 +215,8 @@ def run(
                 job.update(**job.identity, status="queued", error=None)
             os.close(lock)
     log.info(
-        f"{len(jobs)} jobs, {len(jobs) - len(queue)} of them already completed; {at_once} at a time with "
-        f"{engine.threads} cores each"
+        f"{count_of(len(jobs), 'job')}, {len(jobs) - len(queue)} of them already completed; {at_once} at a time with "
+        f"{count_of(engine.threads, 'core')} each"
     )
     running: list[_Running] = []
     passed_on = 0
@@ -310,7 +310,7 @@ def failure(jobs: Sequence[Job]) -> UserError | None:
         more = f" and {len(group) - MOST_LISTED} more" if len(group) > MOST_LISTED else ""
         lines.append(f"  {numbers}{more} {status}: {error}  ({group[0].folder / CONSOLE})")
     return UserError(
-        f"{len(bad)} of {len(jobs)} jobs did not complete:\n" + "\n".join(lines) + "\n"
+        f"{len(bad)} of {count_of(len(jobs), 'job')} did not complete:\n" + "\n".join(lines) + "\n"
         "To run only these jobs again, repeat the command with hydra.sweep.dir=<folder of this sweep>."
     )
 

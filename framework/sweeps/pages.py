@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from framework.errors import ConfigError, DataError, escape_undecodable, escape_unprintable, shorten
+from framework.errors import ConfigError, DataError, count_of, escape_undecodable, escape_unprintable, shorten
 from framework.evaluation.pareto import NOISE, TIME_NOISE, front
 from framework.evaluation.significance import ROUNDING, holm, mean, paired_difference
 from framework.reports.page import PNG, folded, page, paragraph, picture, plain_table, preformatted, wide
@@ -121,9 +121,8 @@ def _failed(jobs: Sequence[Path]) -> Iterator[Failed]:
 def _page(folder: Path, compared: Comparison, failed: Sequence[Failed], figure: "Figure | None") -> str:
     runs, rows = compared.runs, compared.rows
     seeds = list(dict.fromkeys(str(run["seed"]) for run in runs if run.get("seed") is not None))
-    count = f"{len(runs)} run{'s' * (len(runs) > 1)}"
     facts = [
-        count,
+        count_of(len(runs), "run"),
         f"{len(rows)} rows" if len(rows) > 1 else "",
         f"seed{'s' * (len(seeds) > 1)} {', '.join(seeds)}" if seeds else "",
     ]
@@ -284,7 +283,7 @@ def _figures(compared: Comparison) -> str:
         if images:
             seed = f", seed {run['seed']}" if run.get("seed") is not None else ""
             parts.append(folded(f"{name}{seed}", "\n".join(images), opened=len(compared.rows) == 1))
-    note = f"{omitted} figures are not embedded (no PNG, or too large); they are in the folders of the runs."
+    note = f"{count_of(omitted, 'figure')} not embedded (no PNG, or too large); see the folders of the runs."
     return "".join(parts) + (paragraph(note) if omitted else "")
 
 
@@ -319,7 +318,7 @@ def _notes(runs: Sequence[Mapping[str, Any]]) -> str:
         for line in dict.fromkeys(notes):
             counts[line] = counts.get(line, 0) + 1
     lines = [
-        f"{escape_unprintable(line, allowed='')}   ({count} of {len(runs)} runs)"
+        f"{escape_unprintable(line, allowed='')}   ({count} of {count_of(len(runs), 'run')})"
         for line, count in counts.items()
     ]
     return "".join(map(paragraph, lines[:200]))

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import yaml
 
-from framework.errors import ConfigError, did_you_mean
+from framework.errors import ConfigError, count_of, did_you_mean
 from framework.evaluation.pareto import TIME_NOISE, front
 from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, results_table, write_csv
 from framework.storage.files import write_whole
@@ -186,7 +186,7 @@ def rank(
     costs = {key: head for key, head in COST_COLUMNS.items() if any(row[key] is not None for row in rows)}
     columns |= {key: head for key, head in costs.items() if key not in columns}
     console = output()
-    title = f"{len(trials)} trials in {folder}, best first"
+    title = f"{count_of(len(trials), 'trial')} in {folder}, best first"
     better: Better = {key: way or "lower" for key, way in zip(value_keys, measured.ways, strict=True)}
     console.print(results_table(shown, columns, title=title, better=better))
     write_csv(shown, columns, folder / "ranking.csv")

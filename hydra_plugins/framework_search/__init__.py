@@ -18,7 +18,7 @@ from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
-from framework.errors import ConfigError, did_you_mean
+from framework.errors import ConfigError, count_of, did_you_mean
 from hydra_plugins.framework_pool import EngineLauncher
 
 if TYPE_CHECKING:
@@ -163,10 +163,10 @@ class Search(Sweeper):
             _best.write_best(folder, result.best.overrides, loader, summary)
             ranking.write_results(folder, self.name, result, varied)
             if len(self.metrics) == 2:
-                summary = f"{len(result.front)} trials on the front; the first has {summary}"
+                summary = f"{count_of(len(result.front), 'trial')} on the front; the first has {summary}"
         assert self.config is not None
         logger = {"logger": OmegaConf.to_container(self.config.logger)}
-        ranking.close_ranking(folder, f"{description} of {len(trials)} trials; {summary}", logger)
+        ranking.close_ranking(folder, f"{description} of {count_of(len(trials), 'trial')}; {summary}", logger)
 
 
 class RandomSearch(Search):

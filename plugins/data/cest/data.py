@@ -19,7 +19,7 @@ from torch.utils.data import Dataset
 from framework.configuration.paths import FilePath
 from framework.data import Batch, Data, Mapped, Splits
 from framework.datasets.fields import Fields
-from framework.errors import DataError
+from framework.errors import DataError, count_of
 from framework.spectra.fit import fit
 from framework.spectra.offsets import offsets_of
 from framework.spectra.spectrum import COUNT, Parameters, Preset, spectrum
@@ -124,7 +124,9 @@ class CEST(Data, Mapped):
         volume = read_volume(file)
         self.skipped = volume.dropped
         if volume.dropped:
-            _log.warning("%s: %d voxels are left out, because a number is not finite.", file, volume.dropped)
+            _log.warning(
+                "%s: left out, because a number is not finite: %s.", file, count_of(volume.dropped, "voxel")
+            )
         spectra = torch.from_numpy(
             resample(volume.spectra, volume.offsets, self.offsets, str(file)).astype(np.float32)
         )
@@ -262,9 +264,9 @@ def _remarks(volume: Volume, offsets: Sequence[float]) -> tuple[str, ...]:
     remarks = []
     outside = math.prod(volume.shape) - len(volume.spectra) - volume.dropped
     if outside:
-        remarks.append(f"left out: {outside} voxels outside the mask, or without a number")
+        remarks.append(f"left out: {count_of(outside, 'voxel')} outside the mask, or without a number")
     if volume.dropped:
-        remarks.append(f"left out: {volume.dropped} voxels with a number that is not finite")
+        remarks.append(f"left out: {count_of(volume.dropped, 'voxel')} with a number that is not finite")
     if volume.unread:
         remarks.append(f"left out: arrays that are not read ({', '.join(volume.unread)})")
     if len(volume.offsets) != len(offsets) or not np.allclose(volume.offsets, offsets):

@@ -35,7 +35,7 @@ from framework.datasets.new_files import (
     leave_out_trained,
 )
 from framework.datasets.shares import check_shares, choose_splits
-from framework.errors import DataError, did_you_mean, quote, shorten
+from framework.errors import DataError, count_of, did_you_mean, quote, shorten
 from plugins.data.image_folder.idx import Pair, find_pairs, read_pair
 
 LABEL = "label"
@@ -147,7 +147,9 @@ class LabelledImages:
                 [path.relative_to(root).as_posix() for path in files.files],
                 [files.classes[label] for label in files.labels],
                 files.splits,
-                remarks=(f"left out: {files.ignored} files of other kinds",) if files.ignored else (),
+                remarks=(f"left out: {count_of(files.ignored, 'file')} of other kinds",)
+                if files.ignored
+                else (),
             )
         listed = self._select(root, listed)
         classes = set(listed.labels)

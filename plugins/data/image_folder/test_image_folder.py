@@ -48,7 +48,7 @@ def test_folders_by_class_are_split_with_equal_shares(tmp_path: Path) -> None:
     (tmp_path / "a" / "notes.txt").write_text("text", encoding="utf-8")
     data = prepared("image_folder", root=str(tmp_path), validation=0.2, test=0.3, **SMALL)
     assert (data.target.kind, data.target.names) == ("class", ("a", "b"))
-    assert data.remarks == ("left out: 1 files of other kinds",)
+    assert data.remarks == ("left out: 1 file of other kinds",)
     seen = []
     for split, count in zip(SPLITS, (10, 4, 6), strict=True):
         table = fields_of(data, split)

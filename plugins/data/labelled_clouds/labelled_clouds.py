@@ -16,7 +16,7 @@ from torch.utils.data import Dataset
 from framework.data import Batch, Data, Splits
 from framework.datasets import cloud_picture, images
 from framework.datasets.class_folders import FileList
-from framework.errors import DataError, shorten
+from framework.errors import DataError, count_of, shorten
 from framework.geometry import meshes
 from framework.geometry.meshes import READERS
 from framework.storage.names import as_bytes
@@ -149,7 +149,7 @@ def describe_unread(listed: FileList, reading: Reading) -> tuple[str, ...]:
     """
     remarks = []
     if listed.ignored:
-        remarks.append(f"left out: {listed.ignored} files of other kinds")
+        remarks.append(f"left out: {count_of(listed.ignored, 'file')} of other kinds")
     if listed.files:
         mesh = meshes.read(listed.files[0])
         unread = [name for name in mesh.columns if name not in reading.columns]

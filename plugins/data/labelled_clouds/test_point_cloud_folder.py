@@ -59,7 +59,7 @@ def test_every_format_is_read_and_clouds_keep_their_sizes(prepare_data, tmp_path
     assert dataset.columns == ("x", "y", "z")
     assert not dataset.varies
     assert dataset.fingerprint()["ignored"] == "1"
-    assert dataset.remarks[0] == "left out: 1 files of other kinds"
+    assert dataset.remarks[0] == "left out: 1 file of other kinds"
     sizes = []
     for split in dataset.splits():
         batch = split.__getitems__(range(len(split)))

@@ -30,7 +30,7 @@ from framework.datasets.new_files import (
     leave_out_trained,
     restore_trained,
 )
-from framework.errors import DataError
+from framework.errors import DataError, count_of
 from framework.geometry.meshes import stream
 from framework.storage.names import as_bytes, spell_name
 from framework.storage.progress import track_progress
@@ -283,10 +283,10 @@ class LabelledPoints(Data):
             *left_out,
         ]
         if listed.ignored:
-            remarks.append(f"left out: {listed.ignored} files of other kinds")
+            remarks.append(f"left out: {count_of(listed.ignored, 'file')} of other kinds")
         without = sum(int(np.isin(scan.labels, self.unlabelled).sum()) for scan, _ in labelled)
         if without:
-            remarks.append(f"left out: {without} points without a class, which are only neighbours")
+            remarks.append(f"left out, except as neighbours: {count_of(without, 'point')} without a class")
         own = Trained.on(content, names, hashes, splits)
         return _Prepared(names, scaling, Splits(**datasets), fingerprint, tuple(remarks), own, labels)
 

@@ -116,7 +116,7 @@ def test_points_without_a_class_are_only_neighbours(scans):
     save(scans / "train" / "more.npz", points, label=np.full(60, -1))  # a scan without any sample
     data = prepare(scans, unlabelled=[-1])
     assert len(data.splits().test) == 120 + 50
-    assert data.remarks == ("left out: 70 points without a class, which are only neighbours",)
+    assert data.remarks == ("left out, except as neighbours: 70 points without a class",)
 
 
 def test_without_folders_of_splits_whole_scans_are_drawn(tmp_path):
@@ -126,7 +126,7 @@ def test_without_folders_of_splits_whole_scans_are_drawn(tmp_path):
     (tmp_path / "notes.txt").write_text("", encoding="utf-8")
     data = prepare(tmp_path, validation=0.0)
     assert torch.equal(data.splits().train.local, data.splits().validation.local)
-    assert data.remarks == ("left out: 1 files of other kinds",)
+    assert data.remarks == ("left out: 1 file of other kinds",)
 
 
 def test_names_of_classes_belong_to_the_labels_from_0(tmp_path):

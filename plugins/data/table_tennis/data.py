@@ -15,7 +15,7 @@ from framework.configuration.paths import FilePath
 from framework.data import Batch, Data, Splits
 from framework.datasets.csv_columns import Writing
 from framework.datasets.fields import Fields
-from framework.errors import DataError, shorten
+from framework.errors import DataError, count_of, shorten
 from framework.flights.frames import PARTS
 from framework.flights.physics import Constants
 from framework.geometry.meshes import stream
@@ -140,12 +140,15 @@ class TableTennis(Data):
         unread = shorten(", ".join(self._unread_columns))
         remarks = (
             (unread, f"left out: the columns {unread}"),
-            (self.repeated, f"left out: {self.repeated} repeated flights"),
+            (self.repeated, f"left out: {count_of(self.repeated, 'repeated flight')}"),
             (
                 self.short,
-                f"left out: {self.short} flights too short to read {self.grid.least} frames and predict",
+                f"left out: {count_of(self.short, 'flight')} too short to read {self.grid.least} frames and predict",
             ),
-            (self.lost, f"{self.lost} frames are missing, according to the times of the other frames"),
+            (
+                self.lost,
+                f"missing, according to the times of the other frames: {count_of(self.lost, 'frame')}",
+            ),
         )
         self.remarks = tuple(remark for applies, remark in remarks if applies)
 

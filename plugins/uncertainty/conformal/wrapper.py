@@ -14,7 +14,7 @@ from framework.calibration.module_flags import evaluation_mode
 from framework.calibration.validation import nonempty_batches, predict_densities, require_numbers
 from framework.data import Batch
 from framework.distributions.protocol import median
-from framework.errors import ConfigError, UserError
+from framework.errors import ConfigError, UserError, count_of
 from framework.model import Predictor
 from framework.storage.weights import FINITE, require_state
 from framework.target import Target
@@ -201,7 +201,7 @@ class Conformal(Uncertainty):
         self.count.fill_(len(errors))
         bound = 1 - 2 * self.miscoverage - math.sqrt(2 / len(errors))
         self.remark = (
-            f"conformal: CV+ intervals from the residuals of {len(errors)} samples. They hold at least "
+            f"conformal: CV+ intervals from the residuals of {count_of(len(errors), 'sample')}. They hold at least "
             f"{100 * max(0.0, bound):.3g} % of the targets if no model uses the samples that it left out, "
             f"and in practice about {100 * (1 - self.miscoverage):g} %."
         )
@@ -252,15 +252,15 @@ def coverage_remark(count: int, miscoverage: float) -> str:
     left_out = _left_out(count, miscoverage)
     if not left_out:
         return (
-            f"conformal: the threshold is set by {count} validation samples, which are too few: every set holds all "
+            f"conformal: the threshold is set by {count_of(count, 'validation sample')}, too few: every set holds all "
             "values."
         )
     from scipy.special import betaincinv  # importing SciPy takes longer than most commands need it
 
     low, high = betaincinv(count + 1 - left_out, left_out, [0.05, 0.95])
     summary = (
-        f"conformal: the threshold is set by {count} validation samples. With so many samples, the sets hold between "
-        f"{100 * low:.3g} and {100 * high:.3g} % of the targets for 90 % of validation splits, and "
+        f"conformal: the threshold is set by {count_of(count, 'validation sample')}. With so many samples, the sets "
+        f"hold between {100 * low:.3g} and {100 * high:.3g} % of the targets for 90 % of validation splits, and "
         f"{100 * (1 - miscoverage):g} % on average over validation splits"
     )
     if max(high - (1 - miscoverage), 1 - miscoverage - low) <= NEAR:

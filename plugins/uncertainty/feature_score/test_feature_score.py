@@ -197,7 +197,7 @@ def test_with_fewer_samples_than_neighbours_the_farthest_counts():
     wrapper.calibrate(as_batches(inputs, label))
     torch.testing.assert_close(score_of(wrapper, inputs), torch.cdist(inputs, inputs).amax(1))
     assert wrapper.remark == (
-        "feature_score: 9 training samples are stored, fewer than the 50 neighbours that are set."
+        "feature_score: the store holds 9 training samples, fewer than the 50 neighbours that are set."
     )
 
 

@@ -16,7 +16,7 @@ from framework.calibration.validation import nonempty_batches
 from framework.data import Batch
 from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.unchanged import ScoredDensity
-from framework.errors import ConfigError
+from framework.errors import ConfigError, count_of
 from framework.model import Model, Predictor
 from framework.storage.weights import FINITE, FROM_0, require_state
 from framework.target import Target
@@ -224,7 +224,7 @@ class FeatureScore(Uncertainty, ReadsTraining):
                 if len(chosen) < self.neighbours
                 else ""
             )
-            self.remark = f"feature_score: {len(chosen)} training samples are stored{few}."
+            self.remark = f"feature_score: the store holds {count_of(len(chosen), 'training sample')}{few}."
             return
         clusters = fit_clusters(parts, self.classes, self.shrinkage)
         self._store(clusters, "")

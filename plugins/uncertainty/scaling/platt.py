@@ -11,6 +11,7 @@ from torch.distributions import Distribution
 from framework.calibration.validation import nonempty_batches, predict_densities, require_numbers
 from framework.data import Batch
 from framework.distributions.tempering import RescaledClasses, log_probabilities
+from framework.errors import count_of
 from framework.model import Predictor
 from framework.storage.weights import FINITE, require_state
 from framework.target import Target
@@ -86,7 +87,8 @@ class Platt(Uncertainty):
         slope, biases = fit(log_prob, label, smoothing=self.smoothing)
         self.slope.fill_(slope)
         self.biases.copy_(biases)
-        self.remark = f"platt: slope {slope:.3g}, the most likely value for {len(label)} validation samples."
+        rows = count_of(len(label), "validation sample")
+        self.remark = f"platt: slope {slope:.3g}, the most likely value for {rows}."
 
 
 def fit(

@@ -13,6 +13,7 @@ from torch.distributions import Distribution
 from framework.calibration.validation import nonempty_batches, predict_densities, require_numbers
 from framework.data import Batch
 from framework.distributions.tempering import temper
+from framework.errors import count_of
 from framework.model import Predictor
 from framework.storage.weights import require_state
 from framework.uncertainty import Uncertainty
@@ -82,7 +83,9 @@ class Temperature(Uncertainty):
         self.temperature.fill_(fitted)
         rows = sum(len(batch["target"]) for batch in kept_batches)
         value = "most likely" if self.prior is None else "most probable"
-        self.remark = f"temperature: T = {fitted:.3g}, the {value} value for {rows} validation samples."
+        self.remark = (
+            f"temperature: T = {fitted:.3g}, the {value} value for {count_of(rows, 'validation sample')}."
+        )
 
 
 def fit(
