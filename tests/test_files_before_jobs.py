@@ -1,10 +1,12 @@
 """Tests of sweeps, which check the user's files before their jobs start."""
 
+import inspect
 from pathlib import Path
 
 import pytest
 
 from framework.configuration.composition import plain
+from framework.configuration.registry import installed, load
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError, DataError
 from framework.sweeps.rehearsal import refuse_mistakes
@@ -43,3 +45,31 @@ def test_a_sweep_refuses_an_incomplete_column_split_before_any_job(tmp_path: Pat
     ]  # fmt: skip
     with pytest.raises(ConfigError, match=r"angles\.csv line 5.*split.* No job of the sweep was run"):
         refuse_mistakes([(overrides, plain(composed(*overrides)))])
+
+
+ROOTS = [
+    name
+    for name in installed("data")
+    if {"root", "path"} & inspect.signature(load("data", name).__init__).parameters.keys()
+]
+
+
+@pytest.mark.parametrize("name", ROOTS)
+@pytest.mark.parametrize("kind", ["missing", "wrong"])
+def test_a_sweep_refuses_missing_and_wrong_files_of_every_data_set_before_any_job(
+    tmp_path: Path, name: str, kind: str
+) -> None:
+    """Compare `check_files`, which a sweep calls before its jobs, with `prepare`."""
+    (tmp_path / "x.csv").write_text("a,b\n1,2\n", encoding="utf-8")
+    (tmp_path / "note.txt").write_text("This is no data set.", encoding="utf-8")
+    parameters = inspect.signature(load("data", name).__init__).parameters
+    if "root" in parameters:
+        config = {"root": str(tmp_path if kind == "wrong" else tmp_path / "missing")}
+    else:
+        config = {"path": str(tmp_path / ("x.csv" if kind == "wrong" else "missing.csv")), "target": "y"}
+    data = build("data", resolve("data", {"name": name, **config}))
+    with pytest.raises(DataError) as checked:
+        data.check_files()
+    with pytest.raises(DataError) as prepared:
+        data.prepare()
+    assert str(checked.value) == str(prepared.value)

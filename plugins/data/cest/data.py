@@ -119,6 +119,10 @@ class CEST(Data, Mapped):
         """Parameters that are fitted to each spectrum."""
         return Parameters.of(self.preset)
 
+    def check_files(self) -> None:
+        if self.root is not None:
+            read_volume(self._file()[0])
+
     def prepare(self) -> None:
         file, self.synthetic = self._file()
         volume = read_volume(file)

@@ -19,7 +19,7 @@ from framework.datasets.fields import Fields
 from framework.datasets.images import Crop
 from framework.target import Target
 from plugins.data.coil20.manifold import look_alikes, spline_weights
-from plugins.data.coil20.views import STEP_DEG, VIEWS, read_views
+from plugins.data.coil20.views import STEP_DEG, VIEWS, find_views, read_views
 
 GROUPS = ("unique", "look-alikes")
 
@@ -63,6 +63,9 @@ class COIL20(Data):
         self.interpolate = interpolate
         self.jitter = jitter
         self.varies = interpolate or jitter > 0
+
+    def check_files(self) -> None:
+        find_views(self.root)
 
     def prepare(self) -> None:
         views = read_views(self.root, self.image_size)  # (object, view, 1, side, side)

@@ -25,6 +25,16 @@ def read_views(root: str | None, side: int) -> UInt8[Tensor, "object view 1 side
     Raises:
         DataError: `root` is None or has neither layout, or a file is missing, unreadable or of another shape.
     """
+    path = find_views(root)
+    return _read_images(path, side) if path.is_dir() else _read_matlab(path, side)
+
+
+def find_views(root: str | None) -> Path:
+    """Return the MATLAB file of all views, or the folder of their images.
+
+    Raises:
+        DataError: `root` is None, or has neither layout.
+    """
     if root is None:
         raise DataError(
             "data.root is not set: COIL-20 is published for research by Columbia University and is not generated. "
@@ -32,11 +42,11 @@ def read_views(root: str | None, side: int) -> UInt8[Tensor, "object view 1 side
         )
     folder = Path(root).expanduser()
     if folder.is_file():
-        return _read_matlab(folder, side)
+        return folder
     if (folder / FILE).is_file():
-        return _read_matlab(folder / FILE, side)
+        return folder / FILE
     if (folder / "obj1__0.png").is_file():
-        return _read_images(folder, side)
+        return folder
     raise DataError(f"data.root = {folder} holds neither {FILE} nor obj1__0.png. {REMEDY}")
 
 

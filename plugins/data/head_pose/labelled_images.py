@@ -111,6 +111,10 @@ class Heads(Data):
             DataError: The labels cannot be read.
         """
 
+    def check_files(self) -> None:
+        if self.source.root is not None:
+            self.read_labels(self.source.folder())
+
     def prepare(self) -> None:
         root = self.source.folder()
         self.synthetic = read_mark(root) is not None

@@ -132,6 +132,10 @@ class HumanScans(Data, SubjectFolder, HasScenes):
             return Path(self.root).expanduser()
         return Crowd(self.renderer, self.counts, self.drawing, self.data_seed).root
 
+    def check_files(self) -> None:
+        if self.root is not None:
+            scan_layout.read_splits(self.place)
+
     def prepare(self) -> None:
         if self.root is None:
             if self.topology not in self.drawing.topologies:

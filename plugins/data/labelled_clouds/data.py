@@ -10,7 +10,7 @@ import torch
 from pydantic import Field
 
 from framework.configuration.paths import FilePath, Words
-from framework.datasets.class_folders import describe_layouts, list_files
+from framework.datasets.class_folders import FileList, describe_layouts, list_files
 from framework.datasets.class_names import compare_classes, describe_dominant
 from framework.datasets.new_files import (
     TestShare,
@@ -112,6 +112,11 @@ class ModelNet40(FoldersOfClouds):
         self.validation_share = validation_share
         self.rotations = rotations
 
+    def check_files(self) -> None:
+        if self.root is not None:
+            root = Path(self.root).expanduser()
+            folders.list_official(root, self.classes, test_only=self._trained is not None)
+
     def load_clouds(self) -> CloudSet:
         if self.root is None:
             root, name = generate_models(self.models), f"synthetic, seed {self.models.generator_seed}"
@@ -199,14 +204,25 @@ class PointCloudFolder(FoldersOfClouds):
         self.unreadable: Unreadable = unreadable
         self.shares = (validation, test)
 
-    def load_clouds(self) -> CloudSet:
+    def check_files(self) -> None:
+        self._list_files()
+
+    def _list_files(self) -> tuple[Path, FileList]:
+        """Return the folder and its files.
+
+        Raises:
+            DataError: The folder is missing or has another layout.
+        """
         if self.root is None:
             raise DataError(f"data.root is not set. {describe_layouts(READERS)}")
         check_shares(*self.shares)
-        root = Path(self.root).expanduser()
+        root, trained = Path(self.root).expanduser(), self._trained
+        return root, list_files(root, READERS, 2 if trained is None else 1, test_only=trained is not None)
+
+    def load_clouds(self) -> CloudSet:
+        root, listed = self._list_files()
         self.title = root.resolve().name
         trained = self._trained
-        listed = list_files(root, READERS, 2 if trained is None else 1, test_only=trained is not None)
         readable, packed, hashes = load_listed(
             listed, root, self.reading, "point_cloud_folder", self.unreadable
         )
@@ -229,7 +245,7 @@ class PointCloudFolder(FoldersOfClouds):
         return CloudSet(
             source=str(root),
             description={
-                "root": self.root,
+                "root": str(self.root),
                 "version": "point_cloud_folder 1",
                 "columns": ", ".join(self.columns),
                 "points": f"{self.reading.points}, seed {self.reading.seed}",
@@ -284,6 +300,9 @@ class Dales(LabelledClouds):
         self.reading = Reading(points, (), data_seed)
         self.columns = self.reading.all_columns
         self.validation_share = validation_share
+
+    def check_files(self) -> None:
+        read_archive(self.root)
 
     def load_clouds(self) -> CloudSet:
         archive = read_archive(self.root)

@@ -157,6 +157,10 @@ class Pascal3D(Data):
         names = self.categories if len(self.categories) < 4 else (f"{len(self.categories)} classes",)
         self.title = " ".join(["pascal3d", *names])
 
+    def check_files(self) -> None:
+        if self.root is not None:
+            self._roots()
+
     def prepare(self) -> None:
         roots = self._roots()
         self.groups = tuple(roots)

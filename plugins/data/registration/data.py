@@ -155,6 +155,10 @@ class Faust(Bodies):
         self.people = (set(validation), set(test))
         self.data_seed = data_seed
 
+    def check_files(self) -> None:
+        if self.root is not None:
+            read_registration(scans(Path(self.root).expanduser())[0])
+
     def prepare(self) -> None:
         folder = people_root(self.body) if self.root is None else Path(self.root).expanduser()
         scans_found = scans(folder)

@@ -152,6 +152,24 @@ class TableTennis(Data):
         )
         self.remarks = tuple(remark for applies, remark in remarks if applies)
 
+    def check_files(self) -> None:
+        if self.root is None:
+            return
+        first = list_files(Path(self.root).expanduser())[0]
+        if self.unreadable == "error":
+            self._required_flights(first)
+
+    def _required_flights(self, file: Path) -> list[Flight]:
+        """Return the flights of a file; if it cannot be read, name the setting that leaves it out.
+
+        Raises:
+            DataError: The file cannot be read.
+        """
+        try:
+            return self._flights_of(file)
+        except DataError as error:
+            raise DataError(f"{error} Or set data.unreadable=skip to leave such files out.") from error
+
     def _read_flights(self, root: Path) -> tuple[list[Flight], int]:
         """Return the flights of all files, and the number of files that are left out.
 
@@ -161,13 +179,11 @@ class TableTennis(Data):
         unread: list[str] | None = None
         for file in list_files(root):
             try:
-                flights += self._flights_of(file)
+                flights += self._required_flights(file)
                 unread = unread_columns(file, self.writing) if unread is None else unread
-            except DataError as error:
+            except DataError:
                 if self.unreadable == "error":
-                    raise DataError(
-                        f"{error} Or set data.unreadable=skip to leave such files out."
-                    ) from error
+                    raise
                 left_out += 1
         self._unread_columns = unread or []
         return flights, left_out
