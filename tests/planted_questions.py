@@ -207,6 +207,36 @@ def cut_batch(head: Faulty, raw: Tensor) -> Distribution:
     return head.sound(raw)
 
 
+def noisy(head: Faulty, raw: Tensor) -> Distribution:
+    """Return the density of raw parameters with noise, as a dropout that is not turned off adds it."""
+    return head.sound(raw + 0.01 * torch.randn_like(raw))
+
+
+def in_place(head: Faulty, raw: Tensor) -> Distribution:
+    """Return the density of raw parameters that are limited in place."""
+    return head.sound(raw.clamp_(-0.1, 0.1))
+
+
+class SortsTargets(LogisticHead):
+    """Sorts the targets in place when it is calibrated."""
+
+    def calibrate(self, raw: Tensor, target: Tensor) -> None:
+        super().calibrate(raw, target)
+        target.copy_(target.sort(0).values)
+
+
+class CountsPredictions(LogisticHead):
+    """Counts its predictions in a buffer."""
+
+    def __init__(self, target: Target) -> None:
+        super().__init__(target)
+        self.register_buffer("predictions", torch.zeros(()))
+
+    def forward(self, raw: Tensor) -> Distribution:
+        self.predictions += 1
+        return super().forward(raw)
+
+
 FURTHER_FAULTS = (
     *planted_devices.HEADS,
     # estimate
@@ -293,6 +323,16 @@ FURTHER_FAULTS = (
     Fault("rows beyond 256 are the first", ONE, {"forward": cut_batch}, "batch rows are independent"),
     Fault("a batch of two dimensions is transposed", HEIGHT, {"forward": mixed_rows}, "batch rows are independent"),
     Fault("draws seed the generator", HEIGHT, {"sample": reseeding}, "same seed, same bits"),
+    Fault("noise on the raw parameters", HEIGHT, {"forward": noisy}, "no randomness in exact densities"),
+    Fault("noise on a log_prob", CLASSES, {"log_prob": lambda d, v: d.log_prob(v) + 1e-6 * torch.rand(())},
+          "no randomness in exact densities"),
+    Fault("raw parameters are limited in place", HEIGHT, {"forward": in_place}, "no side effects"),
+    Fault("log_prob subtracts from the targets", HEIGHT,
+          {"log_prob": lambda d, v: d.log_prob(v.sub_(1).add(1))}, "no side effects"),
+    Fault("loss subtracts from the targets", ONE,
+          {"loss": lambda h, r, v: -h(r).log_prob(v.sub_(1).add(1))}, "no side effects"),
+    Fault("calibrate sorts the targets", HEIGHT, {}, "no side effects", head=SortsTargets),
+    Fault("a buffer counts predictions", HEIGHT, {}, "no side effects", head=CountsPredictions),
     # heavy tails
     Fault("a heavy tail that is 5 % too high", HEIGHT, {}, "integral", head=LightTails),
     Fault("a heavy tail's gradient is a tenth off where it is narrow", HEIGHT, {}, "loss gradient", head=NarrowSlope),

@@ -86,6 +86,10 @@ def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]
         )
     checks |= {
         "number types": (0.0, lambda worst: _number_types(perturbed(), inputs, worst)),
+        "inputs are left as they are": (
+            0.0,
+            lambda worst: _inputs_unchanged(evaluated(), trained(), inputs, worst),
+        ),
         "same seed, same bits": (0.0, lambda worst: _repeatable(evaluated(), make, inputs, worst)),
         "batch rows are independent": (
             1e-4,
@@ -94,10 +98,6 @@ def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]
         "state-dict round trip": (
             0.0,
             lambda worst: _round_trip(evaluated(), trained(), make, inputs, worst),
-        ),
-        "inputs are left as they are": (
-            0.0,
-            lambda worst: _inputs_unchanged(evaluated(), trained(), inputs, worst),
         ),
         "fixed and vectorises are true": (
             1e-4,

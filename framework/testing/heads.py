@@ -13,7 +13,7 @@ from torch import Tensor
 from framework.density_head import DensityHead, Fitted
 from framework.distributions.circular import Circular, wrap
 from framework.distributions.density import Mixture
-from framework.distributions.protocol import images, median, pick
+from framework.distributions.protocol import estimate, images, median, pick
 from framework.geometry.srgb import linear_from_srgb
 from framework.testing.devices import Calls, OneDevice, check_devices
 from framework.testing.finding import SEED, Finding, Worst, seed
@@ -40,7 +40,9 @@ def examine_head(subject: HeadSubject) -> Iterator[Finding]:
         ("batch shapes", 0.0, _shapes),
         ("number types", 0.0, _number_types),
         ("NaN and infinity refused", 0.0, _refuses_non_finite),
+        ("no side effects", 0.0, _side_effects),
         ("same seed, same bits", 0.0, _repeatable),
+        ("no randomness in exact densities", 0.0, _not_random),
         ("batch rows are independent", 0.0, _rows_apart),
         ("state-dict round trip", 0.0, _round_trip),
         ("mixture of one equals the component", 0.0, _mixture_of_one),
@@ -213,6 +215,55 @@ def _repeatable(subject: HeadSubject, worst: Worst) -> None:
         for comparison, other in {"two runs": head, "two heads": subject.build_anew()}.items():
             for name, again in compute_results(other).items():
                 worst.same_bits(f"{name} of {comparison}", again, first[name])
+
+
+def _not_random(subject: HeadSubject, worst: Worst) -> None:
+    """Check that a log_prob without Monte Carlo error is the same for any seed: a model has one set of numbers."""
+    raw, value = subject.raw_parameters(4), subject.values(4)
+    head = subject.make().eval()
+    results = []
+    for number in (SEED, SEED + 1):
+        seed(number)
+        with torch.no_grad():
+            results.append(estimate(head(raw), value))
+    first, second = results
+    worst.count(False, "log_prob is an estimate from random draws")
+    exact = (first.standard_error == 0) & (second.standard_error == 0)
+    worst.same_bits(
+        "log_prob of a second call with another seed, which `estimate` states to be exact",
+        second.log_mean[exact],
+        first.log_mean[exact],
+    )
+
+
+def _side_effects(subject: HeadSubject, worst: Worst) -> None:
+    """Check that no call changes its arguments, and that predictions change no parameters or buffers.
+
+    Other members of an ensemble read the same features, and several metrics the same targets.
+    """
+    head = subject.make().eval()
+    state = {name: part.clone() for name, part in head.state_dict().items()}
+    raw, value = subject.raw_parameters(4), subject.values(4)
+    arguments = {"the raw parameters": (raw, raw.clone()), "the targets": (value, value.clone())}
+
+    def compare(call: str) -> None:
+        for name, (actual, expected) in arguments.items():
+            worst.same_bits(f"{name} after {call}", actual, expected)
+            actual.copy_(expected)
+
+    with torch.no_grad():
+        density = head(raw)
+        compare("forward")
+        density.log_prob(value)
+        compare("log_prob")
+        head.train().loss(raw, value)
+        compare("loss")
+        head.eval()
+        _ = density.sample(), density.entropy()
+    for name, part in head.state_dict().items():
+        worst.same_bits(f"{name} after a prediction and a loss", part, state[name])
+    head.calibrate(raw, value)
+    compare("calibrate")
 
 
 def _rows_apart(subject: HeadSubject, worst: Worst) -> None:
