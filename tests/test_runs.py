@@ -137,7 +137,7 @@ def test_a_run_killed_after_it_stopped_early_trains_no_further(
         *("+data.signal_at=0", f"+data.signal_marker={tmp_path / 'marker'}"),
     )
     assert killed.code == -signal.SIGKILL, "in its pictures"
-    told = re.compile(r"^stopped early at epoch \d+, kept \d+$", re.MULTILINE)
+    told = re.compile(r"^stopped early at epoch \d+; kept the weights of epoch \d+\b.*$", re.MULTILINE)
     losses, results = killed.losses(), (killed.folder / "results.json").read_text()
     resumed = framework(f"resume={killed.folder}")
     assert resumed.code == 0, resumed.out
@@ -439,18 +439,28 @@ def test_a_store_locked_while_training_costs_no_number(framework: Framework) -> 
     assert dict(stored) == second.losses()
 
 
-def test_a_log_shows_life_and_a_terminal_a_bar(framework: Framework) -> None:
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_log_shows_life_and_a_terminal_a_bar(framework: Framework, every: int) -> None:
     stopping = ("trainer.patience=1", "trainer.max_epochs=9", "optimizer.learning_rate=0.3")
-    log = framework(*QUIET, *stopping, folder="log").out
+    log = framework(*QUIET, *stopping, f"trainer.check_val_every_n_epoch={every}", folder="log").out
     lines = [line for line in log.splitlines() if line.startswith("epoch ")]
     number = r"-?[\d.e+-]+"
-    for epoch, line in enumerate(lines, 1):
-        assert re.fullmatch(f"epoch {epoch} of 9: loss {number}, validation loss {number}", line), line
-    ended = re.search(r"^stopped early at epoch (\d+), kept (\d+)$", log, re.MULTILINE)
+    for epoch, line in enumerate(lines, 1):  # a validation loss only after the epoch that it belongs to
+        validated = f", validation loss {number}" if epoch % every == 0 else ""
+        assert re.fullmatch(f"epoch {epoch} of 9: loss {number}{validated}", line), line
+    ended = re.search(
+        r"^stopped early at epoch (\d+); kept the weights of epoch (\d+), which have the lowest validation loss$",
+        log,
+        re.MULTILINE,
+    )
     assert ended, log
-    assert int(ended[1]) == len(lines) == int(ended[2]) + 1
-    losses = [float(line.rpartition(" ")[2]) for line in lines]
-    assert min(losses) == losses[int(ended[2]) - 1]
+    assert int(ended[1]) == len(lines) == int(ended[2]) + every
+    losses = {
+        epoch: float(line.rpartition(" ")[2])
+        for epoch, line in enumerate(lines, 1)
+        if "validation loss" in line
+    }
+    assert min(losses.values()) == losses[int(ended[2])]
     bar = framework(*QUIET, "trainer.max_epochs=2", folder="bar", more={"FORCE_COLOR": "1"}).out
     assert "━━━" in bar
     assert "epoch 2 of 2: loss" in bar

@@ -213,8 +213,12 @@ def _fit_by_gradient(session: Session, run: Run) -> Fitted:
         trainer.fit(training, datamodule=loaded, ckpt_path=resume, weights_only=True)
         _leave_process_group()
     early = any(isinstance(callback, StopEarly) and callback.stopped for callback in trainer.callbacks)  # type: ignore[attr-defined]
+    ended, kept_epoch = trainer.current_epoch, keep.kept_epoch + 1
+    reason = ", which have the lowest validation loss" if keep.keep == "best" and kept_epoch != ended else ""
     session.console.print(
-        f"{'stopped early at' if early else 'ended at'} epoch {trainer.current_epoch}, kept {keep.kept_epoch + 1}"
+        f"{'stopped early at' if early else 'ended at'} epoch {ended}; kept the weights of epoch {kept_epoch}{reason}",
+        soft_wrap=True,
+        highlight=False,
     )
     is_shortened = {"limit_train_batches", "max_steps", "max_time"} & settings.trainer.keys()
     if not (early or is_shortened or session.data.synthetic):

@@ -17,6 +17,9 @@ BAR_INTERVAL = 0.1
 class Progress(BatchCallback):
     """Callback that shows the epoch (from 1), its mean training loss so far, and the last validation loss.
 
+    If the validation loss was measured after an earlier epoch, the text names this epoch. The line about a finished
+    epoch without a validation holds no validation loss.
+
     Args:
         console: the console to write to; it is quiet in all ranks but the first.
         seconds: time between two lines within a long epoch, if the console is not a terminal.
@@ -26,6 +29,7 @@ class Progress(BatchCallback):
         self.console = console
         self.seconds = seconds
         self._total, self._steps, self._last_line_time = 0.0, 0, 0.0
+        self._validated_epoch: int | None = None
         self._bar: progress.Progress | None = None
         self._task = progress.TaskID(0)
 
@@ -63,10 +67,15 @@ class Progress(BatchCallback):
         elif time.monotonic() - self._last_line_time > self.seconds:
             self._line(trainer, f", step {batch_idx + 1} of {trainer.num_training_batches}")
 
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Remember the epoch of this validation loss."""
+        if not trainer.sanity_checking:
+            self._validated_epoch = trainer.current_epoch
+
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Write a line about the finished epoch, if there is no bar."""
         if self._bar is None:
-            self._line(trainer)
+            self._line(trainer, finished=True)
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Stop the bar."""
@@ -79,14 +88,20 @@ class Progress(BatchCallback):
         """Stop the bar."""
         self.on_train_end(trainer, pl_module)
 
-    def _line(self, trainer: pl.Trainer, step: str = "") -> None:
+    def _line(self, trainer: pl.Trainer, step: str = "", *, finished: bool = False) -> None:
         self._last_line_time = time.monotonic()
-        self.console.print(self._text(trainer, step), soft_wrap=True, highlight=False)
+        self.console.print(self._text(trainer, step, finished=finished), soft_wrap=True, highlight=False)
 
-    def _text(self, trainer: pl.Trainer, step: str = "") -> str:
+    def _text(self, trainer: pl.Trainer, step: str = "", *, finished: bool = False) -> str:
         epochs = trainer.max_epochs or 0
         text = f"epoch {trainer.current_epoch + 1}" + (f" of {epochs}" if epochs > 0 else "") + step
         if self._steps:
             text += f": loss {self._total / self._steps:.4g}"
-        validation = trainer.callback_metrics.get("validation/loss")
-        return text if validation is None else f"{text}, validation loss {float(validation):.4g}"
+        validation, validated_epoch = trainer.callback_metrics.get("validation/loss"), self._validated_epoch
+        if validation is None or validated_epoch is None:
+            return text
+        if validated_epoch == trainer.current_epoch:
+            return f"{text}, validation loss {float(validation):.4g}"
+        if finished:
+            return text
+        return f"{text}, validation loss {float(validation):.4g} after epoch {validated_epoch + 1}"
