@@ -1,6 +1,8 @@
 """Callbacks of Lightning that a config chooses by name."""
 
+import io
 import math
+import re
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -9,18 +11,20 @@ from typing import Any
 import pytest
 import pytorch_lightning as pl
 import torch
+from rich.console import Console
 
 from framework.configuration.command_line import _add_trainer_keys, _name_callbacks
 from framework.configuration.settings import (
     REFUSED_CALLBACKS,
     CallbackSettings,
     GradientAccumulationSettings,
+    ModelSummarySettings,
     Settings,
     WeightAveragingSettings,
 )
 from framework.errors import ConfigError
 from framework.storage import checkpoints
-from framework.training.callbacks import AccumulateGradients, AverageWeights
+from framework.training.callbacks import AccumulateGradients, AverageWeights, PrintSummary
 from tests.conftest import TINY, Framework
 
 QUIET = [*TINY, "logger=none"]
@@ -82,6 +86,22 @@ def test_every_callback_of_lightning_is_known() -> None:
 def test_settings_are_checked(values: object, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         Settings.of({"trainer": {"callbacks": values}})
+
+
+@pytest.mark.parametrize("depth", [0, 1, 2, -1])
+def test_the_summary_counts_parameters_and_states_no_flops_that_it_has_not_measured(depth: int) -> None:
+    module = pl.LightningModule()
+    module.predictor = torch.nn.Sequential(
+        torch.nn.Linear(300, 10), torch.nn.Linear(10, 1).requires_grad_(False)
+    )
+    out = io.StringIO()
+    summary = PrintSummary(ModelSummarySettings(max_depth=depth), Console(file=out, width=80))
+    summary.on_fit_start(pl.Trainer(logger=False, enable_checkpointing=False, accelerator="cpu"), module)
+    printed = out.getvalue()
+    assert "parameters: 3,021, of which 3,010 are trained" in printed
+    assert "flop" not in printed.lower()
+    assert bool(re.search(r"predictor +Sequential +3,021\b", printed)) == (depth != 0)
+    assert bool(re.search(r"predictor\.1 +Linear +11\b", printed)) == (depth in (2, -1))
 
 
 CASES = {

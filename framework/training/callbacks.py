@@ -12,7 +12,10 @@ import torch
 from pytorch_lightning.callbacks import GradientAccumulationScheduler
 from pytorch_lightning.callbacks.weight_averaging import WeightAveraging
 from pytorch_lightning.utilities.model_summary import summarize
+from rich import box
 from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 from torch import Tensor
 
 from framework.configuration.settings import (
@@ -50,7 +53,10 @@ def build_callbacks(chosen: CallbackSettings, keep: KeepCheckpoints, console: Co
 
 
 class PrintSummary(BatchCallback):
-    """Callback that prints Lightning's table of the parts of the model before the training.
+    """Callback that prints a table of the parts of the model before the training.
+
+    The table that Lightning writes has a column of FLOPs, which are 0 because the parts have not computed anything yet.
+    It is not printed; the cost of the model after the test holds its FLOPs.
 
     Args:
         settings: depth of the parts that are listed.
@@ -63,8 +69,21 @@ class PrintSummary(BatchCallback):
 
     def on_fit_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Print the table."""
-        table = str(summarize(pl_module, max_depth=self.settings.max_depth))
-        self.console.print(table, soft_wrap=True, highlight=False, markup=False)
+        summary = summarize(pl_module, max_depth=self.settings.max_depth)
+        table = Table(box=box.SIMPLE_HEAD)
+        table.add_column("part")
+        table.add_column("class")
+        table.add_column("parameters", justify="right")
+        for name, kind, count in zip(
+            summary.layer_names, summary.layer_types, summary.param_nums, strict=True
+        ):
+            table.add_row(Text(name), Text(kind), f"{count:,}")
+        self.console.print(table)
+        self.console.print(
+            f"parameters: {summary.total_parameters:,}, of which {summary.trainable_parameters:,} are trained",
+            soft_wrap=True,
+            highlight=False,
+        )
 
 
 class AccumulateGradients(GradientAccumulationScheduler):
