@@ -19,7 +19,7 @@ from framework.configuration.composition import PluginConfigs, register
 from framework.configuration.composition import folder as folder_of_configs
 from framework.configuration.registry import GROUPS, config_folders, find, installed, load, unusable_names
 from framework.errors import ConfigError
-from framework.modes.plugins import describe, paper, print_plugins
+from framework.modes.plugins import OWN_PACKAGE, describe, paper, print_plugins
 from framework.runs.provenance import package_versions
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -81,6 +81,26 @@ def test_one_name_from_several_packages_is_refused_naming_all_and_breaks_only_it
     for told in ("twin  (refused) Several", "triple  (refused) Several", "other  ", "second-package 1.0"):
         assert told in listed
     assert listed.count("(none installed)") == len(GROUPS) - 2
+
+
+@pytest.mark.parametrize("columns", [40, 80])
+def test_the_list_of_plugins_shows_names_apart_from_descriptions(
+    columns: int, fake: list[EntryPoint], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A name stands further to the left than its description, and only the package of a third-party plugin is named."""
+    fake += [
+        entry("own", "plugins.encoder.mlp.encoder:MLP", "framework.encoder", "robust-visual-learning"),
+        entry("theirs", "plugins.encoder.bps.encoder:BPS", "framework.encoder", "third-package"),
+    ]
+    vars(fake[0].dist)["version"] = OWN_PACKAGE.rpartition(" ")[2]
+    monkeypatch.setenv("COLUMNS", str(columns))
+    print_plugins()
+    lines = capsys.readouterr().out.splitlines()
+    assert all(len(line) <= columns for line in lines)
+    names = [line.split()[0] for line in lines if line.startswith("  ") and not line.startswith("   ")]
+    assert sorted(names) == ["(none"] * (len(GROUPS) - 1) + ["own", "theirs"]
+    text = " ".join(" ".join(lines).split())
+    assert text.count("robust-visual-learning") == 1 and text.count("third-package 1.0") == 1
 
 
 def test_what_is_left_of_a_package_disturbs_nobody(

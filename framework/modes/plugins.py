@@ -10,11 +10,15 @@ from pathlib import Path
 from rich.padding import Padding
 from rich.text import Text
 
+from framework import __version__
 from framework.configuration.citations import look_up
 from framework.configuration.config import Config, Options
 from framework.configuration.registry import GROUPS, Entry, installed, origin, package_folders, unusable_names
 from framework.errors import ConfigError, shorten
 from framework.storage.progress import PlainConsole
+
+OWN_PACKAGE = f"robust-visual-learning {__version__}"
+"""Name and version of the package of this project, as `origin` returns them."""
 
 
 def run(config: Config) -> None:
@@ -24,19 +28,30 @@ def run(config: Config) -> None:
 
 
 def print_plugins() -> None:
-    """Print every registry with the name, description, paper and package of each plugin."""
+    """Print every registry with the name, description and paper of each plugin, and the packages of other projects."""
     console = PlainConsole(highlight=False)
+    console.print(Text(f"From {OWN_PACKAGE}, unless a line names another package:", style="dim"))
     for group in GROUPS:
         console.print(Text(group, style="bold"))
         for entry in installed(group).values():
             plugin = describe(group, entry)
-            console.print(Padding(Text.assemble((plugin.name, "cyan"), "  ", plugin.summary), (0, 0, 0, 2)))
-            source = " · ".join(filter(None, (paper(plugin.bibtex), plugin.origin)))
-            console.print(Padding(Text(source, style="dim"), (0, 0, 0, 6)))
+            _print_indented(console, plugin.name, plugin.summary)
+            package = "" if plugin.origin == OWN_PACKAGE else plugin.origin
+            source = " · ".join(filter(None, (paper(plugin.bibtex), package)))
+            if source:
+                console.print(Padding(Text(source, style="dim"), (0, 0, 0, 6)))
         for name, reason in unusable_names(group).items():
-            console.print(Padding(Text.assemble((name, "cyan"), f"  (refused) {reason}"), (0, 0, 0, 2)))
+            _print_indented(console, name, f"(refused) {reason}")
         if not (installed(group) or unusable_names(group)):
             console.print("  (none installed)")
+
+
+def _print_indented(console: PlainConsole, name: str, text: str) -> None:
+    """Print a name and a text; further lines of the text are indented more than the name."""
+    lines = Text.assemble((name, "cyan"), "  ", text).wrap(console, max(20, console.width - 6))
+    for number, line in enumerate(lines):
+        line.rstrip()
+        console.print(Padding(line, (0, 0, 0, 6 if number else 2)))
 
 
 def paper(bibtex: str) -> str:
