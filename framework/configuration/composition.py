@@ -162,10 +162,15 @@ def help_text() -> str:
 
 
 def _help_paragraph(group: str) -> str:
-    """Return a group with its options, wrapped to the terminal; options of a subfolder stand on lines of their own."""
+    """Return a group with its options, wrapped to the terminal; options of a subfolder stand on lines of their own.
+
+    Options that only other configs choose are left out (`is_part`).
+    """
     width = min(100, get_terminal_size().columns)
     folders: dict[str, list[str]] = {}
     for option in options(group):
+        if is_part(group, option):
+            continue
         top, _, name = option.rpartition("/")
         folders.setdefault(top, []).append(name)
     lines = []
@@ -178,6 +183,14 @@ def _help_paragraph(group: str) -> str:
     if group == "hydra":
         heading = "hydra/launcher=<name> and hydra/sweeper=<name>"
     return "\n".join(["", heading, *lines])
+
+
+def is_part(group: str, option: str) -> bool:
+    """Return whether an option is no choice of its own, but a part of others.
+
+    These options are the bases of experiments and what `debug=fast` changes in a single plugin.
+    """
+    return option.endswith("/base") or (group == "debug" and "/" in option)
 
 
 def groups() -> list[str]:
