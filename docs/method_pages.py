@@ -147,10 +147,21 @@ def chosen(experiment: str) -> dict[str, tuple[str, ...]]:
 
 
 def summary_of_experiment(experiment: str) -> str:
-    """Return the comments at the top of an experiment's file, without its command."""
+    """Return the comments at the top of an experiment's file, and the settings that its command contains.
+
+    Raises:
+        ValueError: The file has no comment that describes the experiment.
+    """
     lines = (ROOT / f"conf/experiment/{experiment}.yaml").read_text(encoding="utf-8").splitlines()
     comments = [line.removeprefix("#").strip() for line in lines if line.startswith("#")]
     text = " ".join(line for line in comments if not line.startswith(("@package", "python -m")))
+    if not text:
+        raise ValueError(
+            f"conf/experiment/{experiment}.yaml has no description. Write it as a comment below the command."
+        )
+    command = next((line for line in comments if line.startswith("python -m")), "")
+    settings = command.partition(f"experiment={experiment}")[2].strip()
+    text = f"{text.removesuffix('.')}. Settings: `{settings}`" if settings else text
     return escape(text).replace("|", "\\|")
 
 
@@ -159,8 +170,9 @@ def experiments_page() -> str:
     parts = [
         "# Experiments",
         "An experiment is a file in `conf/experiment/` that names the parts of a run and their settings. "
-        "`python -m framework experiment=<name>` runs it. Without a folder of real data, the data sets generate small "
-        "synthetic data.",
+        "`python -m framework experiment=<name>` runs it; if the table shows settings, add them to the command. Most "
+        "data sets generate small synthetic data if no folder of real data is given. The experiments under `coil20`, "
+        "`dales`, `images`, `labelled_points`, `tabular` and `uci` need files.",
     ]
     for folder in dict.fromkeys(name.partition("/")[0] for name in experiments()):
         rows = ["| experiment | what it is |", "|---|---|"]

@@ -107,7 +107,15 @@ def table(settings: list[Setting]) -> str:
 
 def settings_page() -> str:
     """Return the page of all settings that do not belong to a plugin."""
-    core = [row for row in model_settings(Settings, "conf/config.yaml") if row.key != "stored"]
+    written = yaml.safe_load((ROOT / "conf/config.yaml").read_text(encoding="utf-8"))["defaults"]
+    chosen = {key: value for item in written if isinstance(item, dict) for key, value in item.items()}
+    core = [
+        row._replace(values="see below", default=code(chosen[row.key]))
+        if row.key in ("optimizer", "trainer", "logger", "mode")
+        else row
+        for row in model_settings(Settings, "conf/config.yaml")
+        if row.key != "stored"
+    ]
     parts = [INTRODUCTION, "## All commands", table(core)]
     for title, model, file in (
         ("`optimizer`", OptimizerSettings, "conf/optimizer/adamw.yaml"),

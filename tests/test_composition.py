@@ -250,6 +250,7 @@ def test_an_experiment_is_its_differences(name: str) -> None:
     lines = (folder() / "experiment" / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
     assert len(lines) <= 30
     assert re.search(f"python -m framework (-m )?experiment={name}", lines[1])
+    assert re.match(r"# \S", lines[2]), "the page of experiments shows this description"
 
 
 @pytest.mark.parametrize(
