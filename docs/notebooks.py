@@ -10,6 +10,7 @@ notebook without outputs.
 
 import base64
 import datetime
+import itertools
 import os
 import re
 import sys
@@ -30,6 +31,8 @@ LIMIT = 300
 """Longest time of a cell, s."""
 MOST_LINES = 44
 """Largest number of lines of an output that a page shows; the lines in the middle are left out."""
+MOST_EPOCHS = 12
+"""Largest number of epochs of a training that a page shows; of a longer training it shows the first and last two."""
 
 
 def without_outputs(text: str) -> str:
@@ -118,12 +121,28 @@ def described(cell: str) -> str:
 
 
 def shortened(output: str) -> str:
-    """Return an output without trailing blanks, and without the middle of a long output."""
+    """Return an output without trailing blanks, most epochs of a training, and the middle of a long output."""
     lines = [line.rpartition("\r")[2].rstrip() for line in output.strip("\n").split("\n")]
-    if len(lines) > MOST_LINES:
-        half = MOST_LINES // 2
-        lines = [*lines[:half], f"[… {len(lines) - 2 * half} lines …]", *lines[-half:]]
-    return "\n".join(lines)
+    groups = itertools.groupby(lines, key=lambda line: re.match(r"epoch \d+ of \d+: ", line) is not None)
+    lines = [
+        line
+        for is_training, group in groups
+        for line in (_without_epochs([*group]) if is_training else group)
+    ]
+    return "\n".join(_without_middle(lines, MOST_LINES))
+
+
+def _without_epochs(lines: list[str]) -> list[str]:
+    """Return the lines of a training, without the middle of a long one."""
+    return lines if len(lines) <= MOST_EPOCHS else _without_middle(lines, 4)
+
+
+def _without_middle(lines: list[str], most: int) -> list[str]:
+    """Return at most `most` lines and, in place of the others, a line that says how many are left out."""
+    if len(lines) <= most + 1:
+        return lines
+    half = most // 2
+    return [*lines[:half], f"[… {len(lines) - 2 * half} lines …]", *lines[-half:]]
 
 
 def main() -> None:
