@@ -107,10 +107,12 @@ def _run() -> None:
     from framework.configuration.command_line import command_line
     from framework.configuration.composition import folder, help_text, plain, register
     from framework.storage.files import remove_empty_folders
+    from framework.storage.working_directory import refuse_settings
 
     if {"--help", "-h"} & set(sys.argv[1:]):
         sys.stdout.write(help_text() + "\n")
         return
+    refuse_settings(("numba", "matplotlib"))
     import hydra
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import DictConfig

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from framework.errors import UserError
 from framework.storage.closed_pipes import survive_closed_pipes
 from framework.storage.files import describe_unwritable
+from framework.storage.working_directory import refuse_settings
 
 
 def run_command(main: Callable[[list[str]], object]) -> None:
@@ -17,6 +18,7 @@ def run_command(main: Callable[[list[str]], object]) -> None:
     """
     survive_closed_pipes()
     try:
+        refuse_settings(("numba", "matplotlib"))
         main(sys.argv[1:])
     except UserError as error:
         sys.exit(f"error: {error}")

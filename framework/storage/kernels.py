@@ -16,6 +16,9 @@ from framework.errors import DataError
 from framework.storage.cache import folder
 from framework.storage.first_rank import first_rank
 from framework.storage.progress import QUIET_TIME
+from framework.storage.working_directory import refuse_settings
+
+refuse_settings(("numba",))  # before compiled code is loaded from a folder that the settings name
 
 
 def kernel_cache(name: str, sources: Iterable[Path]) -> str | None:

@@ -17,8 +17,10 @@ from pathlib import Path
 from typing import Any, Literal, final
 
 from framework.errors import ConfigError
+from framework.storage.enclosed import require_plain_within
 from framework.storage.files import write_whole
 from framework.storage.text import defuse_formulas
+from framework.storage.working_directory import refuse_settings
 from framework.tracking.journal import Journal
 from framework.tracking.tracker import Status, Tracker
 
@@ -26,15 +28,23 @@ _log = logging.getLogger(__name__)
 
 Form = Literal["csv", "tensorboard", "wandb"]
 PACKAGES: Mapping[Form, str] = {"tensorboard": "tensorboard", "wandb": "wandb"}
+WANDB_PARENT = Path("outputs")
+"""Folder in which wandb makes its own folder, unless the environment variable WANDB_DIR names another one."""
 """Package that a format needs; the extra of this project with the name of the format installs it."""
 
 
 def require_packages(forms: Sequence[Form]) -> None:
-    """Refuse a format whose package is not installed.
+    """Refuse a format whose package is not installed, or would read settings from the working directory.
 
     Raises:
-        ConfigError: The package is missing.
+        ConfigError: The package is missing, the working directory contains a settings file of wandb, or a link takes
+            the place of the folder to which wandb writes.
     """
+    if "wandb" in forms:
+        refuse_settings(("wandb",))
+        if "WANDB_DIR" not in os.environ:
+            for name in ("wandb", ".wandb"):  # wandb writes to the second if it exists
+                require_plain_within(WANDB_PARENT / name, WANDB_PARENT, ConfigError)
     for form in forms:
         if form in PACKAGES and find_spec(PACKAGES[form]) is None:
             raise ConfigError(
@@ -154,7 +164,7 @@ class WandbCopy(Copy):
             os.environ.setdefault("WANDB_MODE", "offline")
             os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
             wandb = importlib.import_module("wandb")
-            folder = Path(os.environ.get("WANDB_DIR", "outputs"))
+            folder = Path(os.environ.get("WANDB_DIR", WANDB_PARENT))
             folder.mkdir(parents=True, exist_ok=True)
             self._run = wandb.init(
                 dir=str(folder),
