@@ -24,7 +24,8 @@ class Segmentation(Metric):
     - `iou_<class>`: intersection over union of one class; NaN if it is neither true nor predicted.
 
     The standard errors are those of the jackknife over scans (Efron & Tibshirani 1993, eq. 11.5). The points of one
-    scan are not independent, so that a standard error over points would be far too small. With one scan, they are NaN.
+    scan are not independent, so that a standard error over points would be far too small. With one scan, they are NaN,
+    and so is that of a class that is true or predicted in one scan only.
 
     Raises:
         ConfigError: The target is not a class, or the batches have no field "scan".
@@ -75,9 +76,9 @@ class Segmentation(Metric):
         total = counts.sum(0)
         whole, left_out = shares(total[None])[0], shares(total - counts)
         scans = len(number)
-        spread = (left_out - left_out.nanmean(0)).square().nansum(0)
+        # NaN if a number is not known without one of the scans: its class then occurs in this scan only
+        spread = (left_out - left_out.mean(0)).square().sum(0)
         error = (spread * ((scans - 1) / scans)).sqrt().where(torch.tensor(scans > 1), torch.nan)
-        error = error.where(~whole.isnan(), torch.nan)
         keys = ("point_accuracy", "mean_iou", *(f"iou_{name}" for name in self.names))
         return {
             **dict(zip(keys, whole, strict=True)),

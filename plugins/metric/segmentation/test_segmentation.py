@@ -63,6 +63,17 @@ def test_an_absent_class_is_left_out_and_one_scan_has_no_standard_error():
     assert all(math.isnan(value) for key, value in actual.items() if key.endswith("_sem"))
 
 
+@pytest.mark.parametrize("predicted_elsewhere", [False, True])
+def test_a_class_of_one_scan_has_no_standard_error(predicted_elsewhere):
+    """All other scans say nothing of such a class, so that the jackknife would give it an error near 0."""
+    label, scan = np.array([0, 1, 2, 2, 0, 1, 0, 1]), np.array([0, 0, 0, 0, 1, 1, 2, 2])
+    guess = np.array([0, 1, 2, 0, 0, 0, 1, 2 if predicted_elsewhere else 1])
+    actual = compute(guess, label, scan)
+    assert math.isfinite(actual["iou_tree"])
+    assert math.isnan(actual["iou_tree_sem"]) is not predicted_elsewhere
+    assert all(actual[f"{key}_sem"] > 0 for key in ("point_accuracy", "mean_iou", "iou_ground", "iou_car"))
+
+
 def test_samples_without_scans_and_wrong_labels_are_refused():
     density = Categorical(logits=torch.zeros(2, 3), validate_args=False)
     metric = Segmentation(Target("class", NAMES))
