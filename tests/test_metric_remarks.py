@@ -8,6 +8,7 @@ from torch.distributions import Categorical, Independent, Normal
 
 from framework.configuration.schema import build, resolve
 from framework.evaluation.splits import evaluate
+from framework.prediction import Prediction
 from framework.target import Target
 from framework.testing.plain import LENGTH, Plain
 
@@ -49,10 +50,27 @@ def test_a_coverage_far_below_the_stated_one_is_reported_once(
 
     device = torch.device("cpu")
     evaluate(Sets(), batches, [metric], groups=("all",), samples=1, seed=0, device=device)
-    messages = [record.message for record in caplog.records if "prediction_set" in record.message]
+    messages = [record.message for record in caplog.records if "are stated" in record.message]
     assert len(messages) == is_reported
     if is_reported:
         assert f"hold {100 * inside / count:.3g} % of the test targets, but 90 % are stated" in messages[0]
+
+
+@pytest.mark.parametrize(
+    ("rare", "is_reported"), [(0, False), (2, False), (30, True), (99, True)], ids=lambda part: str(part)
+)
+def test_a_class_that_the_sets_leave_out_is_reported(rare: int, *, is_reported: bool) -> None:
+    """Sets that hold class 0 alone cover nine tenths of all targets, but no target of the rare class."""
+    metric = build("metric", resolve("metric", "prediction_set"), target=CLASSES)
+    labels = torch.cat([torch.zeros(1000), torch.ones(rare)]).long()
+    for part in labels.split(64):
+        logits = torch.tensor([4.0, 0.0, 0.0]).double().expand(len(part), 3)
+        density = Categorical(logits=logits, validate_args=False)
+        sets = PredictionSet(density, torch.tensor(1.0).double(), "density", 0.9)
+        metric.update(Prediction(sets, {"target": part}))
+    assert len(metric.remarks()) == is_reported
+    if is_reported:
+        assert f"but not of each class: 0% of {rare} 'b'. A set without" in metric.remarks()[0]
 
 
 @pytest.mark.parametrize("name", ["log_likelihood", "nll"])

@@ -7,13 +7,15 @@ import torch
 from torch import Tensor
 
 from framework.distributions.protocol import value_set
-from framework.errors import UserError
+from framework.errors import UserError, quote, shorten
 from framework.metric import Directions, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 
 MISSED, ERRORS = 0.05, 4
 """Smallest difference between stated and found coverage that is reported, also in standard errors."""
+FEWEST = 10
+"""Smallest number of samples whose coverage is reported."""
 
 
 class PredictionSetMetric(Metric):
@@ -38,6 +40,7 @@ class PredictionSetMetric(Metric):
     size: Tensor
     squares: Tensor
     empty: Tensor
+    by_class: Tensor
 
     def __init__(self, target: Target) -> None:
         super().__init__()
@@ -50,9 +53,14 @@ class PredictionSetMetric(Metric):
             "set_empty": "empty sets",
         }
         self.stated: float | None = None
+        self.classes = target.names if target.kind == "class" else ()
         self.better = {self.key: "lower"}  # pyright: ignore[reportAttributeAccessIssue]
         for name in ("count", "covered", "size", "squares", "empty"):
             self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        # number of test samples of each class, and of those in their sets
+        self.add_state(
+            "by_class", torch.zeros(len(self.classes), 2, dtype=torch.float64), dist_reduce_fx="sum"
+        )
 
     def update(self, prediction: Prediction) -> None:
         if len(prediction.target) == 0:
@@ -76,7 +84,11 @@ class PredictionSetMetric(Metric):
                 "whether the training diverged."
             )
         self.count += len(size)
-        self.covered += sets.contains(prediction.target).sum()
+        inside = sets.contains(prediction.target)
+        self.covered += inside.sum()
+        if self.classes:
+            counts = torch.stack([torch.ones_like(size), inside.to(size)], -1).double()
+            self.by_class.index_add_(0, prediction.target.long(), counts)
         self.size += self.unit * size.sum()
         self.squares += (self.unit * size).square().sum()
         self.empty += sets.empty().sum()
@@ -99,14 +111,31 @@ class PredictionSetMetric(Metric):
         }
 
     def remarks(self) -> tuple[str, ...]:
-        results = self.compute()
-        found = float(results["set_coverage"])
-        if self.stated is None or not found < self.stated - MISSED:
+        if self.stated is None:
             return ()
-        if self.stated - found < ERRORS * math.sqrt(self.stated * (1 - self.stated) / float(self.count)):
+        if self._misses(float(self.covered), float(self.count)):
+            found = float(self.covered / self.count)
+            return (
+                f"prediction_set: the sets hold {100 * found:.3g} % of the test targets, but {100 * self.stated:.4g} % "
+                "are stated. The test samples differ from the validation samples that set the threshold, as later rows "
+                "or other groups do, or these are few. Rely neither on the sets nor on the densities for such samples.",
+            )
+        missed = [
+            f"{covered / count:.0%} of {count:.0f} {quote(name)}"
+            for name, (count, covered) in zip(self.classes, self.by_class.tolist(), strict=True)
+            if self._misses(covered, count)
+        ]
+        if not missed:
             return ()
         return (
-            f"prediction_set: the sets hold {100 * found:.3g} % of the test targets, but {100 * self.stated:.4g} % are "
-            "stated. The test samples differ from the validation samples that set the threshold, as later rows or "
-            "other groups do, or these are few. Do not rely on the sets, nor on the densities, for such samples.",
+            f"prediction_set: the sets hold {100 * self.stated:.4g} % of the targets on average over classes, but not "
+            f"of each class: {shorten(', '.join(missed), 200)}. A set without such a class does not exclude it.",
         )
+
+    def _misses(self, covered: float, count: float) -> bool:
+        """Return whether a share of covered targets is below the stated one by more than chance explains."""
+        assert self.stated is not None
+        if count < FEWEST:
+            return False
+        chance = ERRORS * math.sqrt(self.stated * (1 - self.stated) / count)
+        return self.stated - covered / count > max(MISSED, chance)
