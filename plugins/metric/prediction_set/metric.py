@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
+from torchmetrics.utilities.data import dim_zero_cat
 
 from framework.distributions.protocol import value_set
 from framework.errors import UserError, quote, shorten
@@ -37,8 +38,7 @@ class PredictionSetMetric(Metric):
     better: ClassVar[Directions] = {}
     count: Tensor
     covered: Tensor
-    size: Tensor
-    squares: Tensor
+    sizes: list[Tensor] | Tensor
     empty: Tensor
     by_class: Tensor
 
@@ -55,8 +55,10 @@ class PredictionSetMetric(Metric):
         self.stated: float | None = None
         self.classes = target.names if target.kind == "class" else ()
         self.better = {self.key: "lower"}  # pyright: ignore[reportAttributeAccessIssue]
-        for name in ("count", "covered", "size", "squares", "empty"):
+        for name in ("count", "covered", "empty"):
             self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        # all sizes, because sums of squares lose the digits of the spread if the sizes are nearly equal
+        self.add_state("sizes", [], dist_reduce_fx="cat")
         # number of test samples of each class, and of those in their sets
         self.add_state(
             "by_class", torch.zeros(len(self.classes), 2, dtype=torch.float64), dist_reduce_fx="sum"
@@ -89,17 +91,22 @@ class PredictionSetMetric(Metric):
         if self.classes:
             counts = torch.stack([torch.ones_like(size), inside.to(size)], -1).double()
             self.by_class.index_add_(0, prediction.target.long(), counts)
-        self.size += self.unit * size.sum()
-        self.squares += (self.unit * size).square().sum()
+        assert isinstance(self.sizes, list)
+        self.sizes.append(self.unit * size.double())
         self.empty += sets.empty().sum()
 
     def compute(self) -> dict[str, Tensor]:
-        coverage, size, empty = (total / self.count for total in (self.covered, self.size, self.empty))
-        # The variance is the mean square minus the square of the mean; the squares of 0 and 1 are 0 and 1.
-        mean_squares = (coverage, self.squares / self.count, empty)
+        coverage, empty = self.covered / self.count, self.empty / self.count
+        sizes = dim_zero_cat(self.sizes) if len(self.sizes) else coverage.new_zeros(0)
+        size = sizes.sum() / self.count
+        # the mean square of zeros and ones is their mean
+        spreads = (
+            coverage - coverage.square(),
+            (sizes - size).square().sum() / self.count,
+            empty - empty.square(),
+        )
         coverage_error, size_error, empty_error = (
-            ((square - mean.square()).clamp(min=0) / (self.count - 1).clamp(min=0)).sqrt()
-            for mean, square in zip((coverage, size, empty), mean_squares, strict=True)
+            (spread / (self.count - 1).clamp(min=0)).sqrt() for spread in spreads
         )
         return {
             "set_coverage": coverage,
