@@ -298,6 +298,20 @@ def per_batch(metric: Any, prediction: Prediction) -> None:
 SEM, TURNS, UNIT, NAN = "standard errors", "turns do not matter", "unit", "NaN is not hidden"
 BATCHES, ORDER, LEFT = "batches do not matter", "order does not matter", "predictions are left as they are"
 ALL_FAULTS = (
+    Fault(
+        "one remark is no tuple",
+        "remarks are sentences",
+        Kept,
+        {"remarks": lambda metric: "Many are far."},
+        HEIGHT,
+    ),
+    Fault(
+        "remarks need a sample",
+        "remarks are sentences",
+        Kept,
+        {"remarks": lambda metric: (f"The first is {metric.all()[0]}.",)},
+        PLACE,
+    ),
     Fault("± is the deviation of samples", SEM, Kept, {"spread": deviation_alone}, HEIGHT),
     Fault("± is half of an interval", SEM, Kept, {"spread": half_interval}, PLACE),
     Fault("± is divided by n, not by its root", SEM, Kept, {"spread": divided_by_count}, HEIGHT),

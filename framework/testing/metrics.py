@@ -21,7 +21,7 @@ from torch.distributions import (
 
 from framework.distributions.circular import circular
 from framework.distributions.protocol import estimate, exact_estimate, marginal, median, pick, take
-from framework.errors import UserError
+from framework.errors import UserError, shorten
 from framework.metric import Metric
 from framework.prediction import Prediction, Split
 from framework.target import Target
@@ -165,6 +165,7 @@ def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
         "on the device of its inputs": (0.0, lambda worst: _on_one_device(build, whole, worst)),
         "named numbers": (0.0, lambda worst: _column_names(build, whole, worst)),
         "NaN without samples": (0.0, lambda worst: _no_samples(build, whole, worst)),
+        "remarks are sentences": (0.0, lambda worst: _remarks(build, whole, worst)),
         "batches do not matter": (1e-9, lambda worst: _batches(build, whole, many, worst)),
         "order does not matter": (1e-9, lambda worst: _order(build, whole, many, worst)),
         "states merge": (1e-9, lambda worst: _merge(build, whole, worst)),
@@ -316,6 +317,21 @@ def _column_names(build: Make, predict: Predict, worst: Worst) -> None:
         all(value.isnan().item() for value in numbers.values()),
         "every number is NaN for ordinary predictions",
     )
+
+
+def _remarks(build: Make, predict: Predict, worst: Worst) -> None:
+    """Check that the remarks are a tuple of strings, with samples and without; a string would be logged by letters."""
+    for situation, parts in {"no update": [], "ordinary predictions": [torch.arange(SAMPLES)]}.items():
+        metric = build()
+        torch.manual_seed(SEED)
+        for part in parts:
+            _update(metric, predict, part)
+        remarks: object = metric.remarks()
+        is_tuple = isinstance(remarks, tuple) and all(isinstance(remark, str) for remark in remarks)
+        worst.count(
+            not is_tuple,
+            f"{situation}: remarks returns {shorten(repr(remarks), 60)}, expected a tuple of strings",
+        )
 
 
 def _no_samples(build: Make, predict: Predict, worst: Worst) -> None:

@@ -9,6 +9,7 @@ from framework.testing.rows import ANGLE, CLASSES, MetricRow
 NO_SET = "the densities of the contract tests have no prediction sets; the metric's own test runs this check on sets"
 CHECKS = (
     "named numbers",
+    "remarks are sentences",
     "batches do not matter",
     "order does not matter",
     "states merge",
