@@ -36,6 +36,8 @@ PAGES = {
     "mode=new": "docs/how_to/add_a_plugin.md",
     "mode=check": "docs/how_to/add_a_plugin.md",
     "mode=sync": "docs/how_to/tracking.md",
+    "mode=report": "docs/how_to/figures.md",
+    "mode=work_precision": "docs/explanation/error_and_run_time.md",
     **dict.fromkeys(("logger=[", "logger=tensorboard", "logger=wandb", "logger."), "docs/how_to/tracking.md"),
     "mode=": "docs/commands.md",
     "data=tabular": "docs/tables.md",

@@ -97,7 +97,8 @@ def first_knob(predictor: Predictor) -> str:
     for part in parts_with_knobs(predictor):
         return next(iter(part.knobs))
     raise ConfigError(
-        "No part of this model has a knob, so the model cannot trade error for run time. Choose another model."
+        "No part of this model has a knob, such as the number of members of an ensemble or of samples of a latent "
+        "variable. The model cannot trade error for run time; choose a model that has a knob."
     )
 
 

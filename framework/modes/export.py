@@ -1,5 +1,6 @@
 """mode=export: write a trained model as a folder that runs with NumPy and ONNX Runtime alone."""
 
+import shlex
 from pathlib import Path
 
 from framework.configuration.config import Config, Options
@@ -48,3 +49,5 @@ def run(config: Config) -> None:
         console.print(f"processor milliseconds of a batch of {count}: {forms}", soft_wrap=True)
     for remark in description.remarks:
         console.print(remark, soft_wrap=True)
+    programs = (shlex.join(["python", str(into / name), "--help"]) for name in ("predict.py", "serve.py"))
+    console.print("next commands: " + "\n               ".join(programs), soft_wrap=True, highlight=False)

@@ -37,7 +37,9 @@ def run(config: Config) -> None:
         except UserError as error:
             errors.append(error)
         else:
-            PlainConsole().print(f"{count_of(lines, 'journal line')} sent from {run}.")
+            PlainConsole().print(
+                f"{count_of(lines, 'journal line')} sent from {run}.", soft_wrap=True, highlight=False
+            )
     if len(errors) == 1:
         raise errors[0]
     if errors:

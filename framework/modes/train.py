@@ -19,7 +19,7 @@ def run(config: Config) -> float:
     config.options(Options)
     session = for_training(config)
     with open_run(config) as run:
-        session.console.print(f"run folder: {run.folder}")
+        session.console.print(f"run folder: {run.folder}", soft_wrap=True, highlight=False)
         session.record(run)
         loss, epoch, pruned = fit(session, run)
         if not first_rank():

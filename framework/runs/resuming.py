@@ -248,7 +248,7 @@ def begin_again(run: "Run", console: "Console", processes: int, models: int) -> 
             "run on as many processes as before."
         )
     run.tracker.drop_after(step)
-    console.print(f"resuming from {checkpoint} (step {step}).")
+    console.print(f"resuming from {checkpoint} (step {step}).", soft_wrap=True, highlight=False)
     if before != processes:
         console.print(
             f"{before} processes trained before, and {processes} train from here on: the results are those of one run "
