@@ -2,6 +2,7 @@
 wrappers."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -158,13 +159,15 @@ def test_few_rows_are_said_with_what_they_leave_open(rows: int, miscoverage: flo
     kept = rows - int((rows + 1) * miscoverage * (1 + 1e-12))
     if kept == rows:
         assert "every set holds all values" in said and wrapper.threshold.isinf()
+        least = int(re.search(r"At least (\d+) are needed", said)[1])
+        assert (least + 1) * miscoverage >= 1 - 1e-9 and least * miscoverage < 1
         return
     low, high = stats.beta(kept + 1, rows - kept).ppf([0.05, 0.95])
     assert f"between {100 * low:.3g} and {100 * high:.3g} %" in said
     scores = torch.rand(4000, rows, generator=generator).sort(1).values[:, kept]
     inside = ((scores >= low) & (scores <= high)).double().mean().item()
     assert inside == pytest.approx(0.9, abs=0.02)
-    assert ("keep the deviation within" in said) == (
+    assert ("this share would be within" in said) == (
         max(high - 1 + miscoverage, 1 - miscoverage - low) > 0.03
     )
 

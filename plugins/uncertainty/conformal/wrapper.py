@@ -166,7 +166,7 @@ class Conformal(Uncertainty):
                 "probability above 0.",
                 len(scores),
                 self.miscoverage,
-                math.ceil(1 / self.miscoverage) - 1,
+                _least(self.miscoverage),
             )
 
     @torch.no_grad()
@@ -253,26 +253,35 @@ def coverage_remark(count: int, miscoverage: float) -> str:
     if not left_out:
         return (
             f"conformal: the threshold is set by {count_of(count, 'validation sample')}, too few: every set holds all "
-            "values."
+            f"values. At least {_least(miscoverage)} are needed."
         )
     from scipy.special import betaincinv  # importing SciPy takes longer than most commands need it
 
     low, high = betaincinv(count + 1 - left_out, left_out, [0.05, 0.95])
+    stated = f"{100 * (1 - miscoverage):g} %"
     summary = (
-        f"conformal: the threshold is set by {count_of(count, 'validation sample')}. With so many samples, the sets "
-        f"hold between {100 * low:.3g} and {100 * high:.3g} % of the targets for 90 % of validation splits, and "
-        f"{100 * (1 - miscoverage):g} % on average over validation splits"
+        f"conformal: the threshold is set by {count_of(count, 'validation sample')}. The sets hold {stated} of the "
+        "targets on average over validation splits. In nine of ten splits of this size, they hold between "
+        f"{100 * low:.3g} and {100 * high:.3g} %"
     )
     if max(high - (1 - miscoverage), 1 - miscoverage - low) <= NEAR:
         return f"{summary}."
     wanted = math.ceil(miscoverage * (1 - miscoverage) * (NINETY / NEAR) ** 2)
-    return f"{summary}. About {wanted:,} samples would keep the deviation within {100 * NEAR:g} %."
+    return (
+        f"{summary}. With about {wanted:,} samples, this share would be within {100 * NEAR:g} percentage points of "
+        f"{stated}."
+    )
 
 
 def _left_out(count: int, miscoverage: float) -> int:
     """Return ⌊(n + 1) α⌋, the number of scores at or above the threshold, for n = `count` and α = `miscoverage`."""
     # α is rounded, so that (n + 1) α may fall just below an integer; the factor corrects that
     return min(count, math.floor((count + 1) * miscoverage * (1 + 1e-12)))
+
+
+def _least(miscoverage: float) -> int:
+    """Return the smallest number n of scores with (n + 1) α ≥ 1, for which the sets do not hold all values."""
+    return max(1, math.ceil(1 / miscoverage - 1e-9) - 1)
 
 
 def threshold(scores: Float[Tensor, "sample"], miscoverage: float) -> float:
