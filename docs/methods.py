@@ -94,8 +94,12 @@ def page(*, of_site: bool = False) -> str:
 def row(entry: EntryPage, *, of_site: bool) -> str:
     """Return the line of one entry point."""
     description = entry.description
+    first_name = next(
+        other.name for other in entries() if (other.group, other.value) == (entry.group, entry.value)
+    )
+    summary = description.summary if first_name == entry.name else f"The same plugin as `{first_name}`."
     link = entry.page if of_site else f"../{entry.folder.as_posix()}/README.md"
-    cells = (f"[`{entry.name}`]({link})", description.summary, paper(description.bibtex))
+    cells = (f"[`{entry.name}`]({link})", summary, paper(description.bibtex))
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 

@@ -90,16 +90,19 @@ def test_the_list_of_plugins_shows_names_apart_from_descriptions(
     """A name stands further to the left than its description, and only the package of a third-party plugin is named."""
     fake += [
         entry("own", "plugins.encoder.mlp.encoder:MLP", "framework.encoder", "robust-visual-learning"),
+        entry("own_again", "plugins.encoder.mlp.encoder:MLP", "framework.encoder", "robust-visual-learning"),
         entry("theirs", "plugins.encoder.bps.encoder:BPS", "framework.encoder", "third-package"),
     ]
-    vars(fake[0].dist)["version"] = OWN_PACKAGE.rpartition(" ")[2]
+    for own in fake[:2]:
+        vars(own.dist)["version"] = OWN_PACKAGE.rpartition(" ")[2]
     monkeypatch.setenv("COLUMNS", str(columns))
     print_plugins()
     lines = capsys.readouterr().out.splitlines()
     assert all(len(line) <= columns for line in lines)
     names = [line.split()[0] for line in lines if line.startswith("  ") and not line.startswith("   ")]
-    assert sorted(names) == ["(none"] * (len(GROUPS) - 1) + ["own", "theirs"]
+    assert sorted(names) == ["(none"] * (len(GROUPS) - 1) + ["own", "own_again", "theirs"]
     text = " ".join(" ".join(lines).split())
+    assert "own_again The same plugin as own." in text
     assert text.count("robust-visual-learning") == 1 and text.count("third-package 1.0") == 1
 
 

@@ -3,6 +3,7 @@
 import ast
 import re
 import unicodedata
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +34,11 @@ def print_plugins() -> None:
     console.print(Text(f"From {OWN_PACKAGE}, unless a line names another package:", style="dim"))
     for group in GROUPS:
         console.print(Text(group, style="bold"))
+        first_names = names_by_value(installed(group).values())
         for entry in installed(group).values():
+            if first_names[entry.value] != entry.name:
+                _print_indented(console, entry.name, f"The same plugin as {first_names[entry.value]}.")
+                continue
             plugin = describe(group, entry)
             _print_indented(console, plugin.name, plugin.summary)
             package = "" if plugin.origin == OWN_PACKAGE else plugin.origin
@@ -44,6 +49,14 @@ def print_plugins() -> None:
             _print_indented(console, name, f"(refused) {reason}")
         if not (installed(group) or unusable_names(group)):
             console.print("  (none installed)")
+
+
+def names_by_value(entries: Iterable[Entry]) -> dict[str, str]:
+    """Return the first name of each class among the entry points of a registry, by the value of the entry point."""
+    names: dict[str, str] = {}
+    for entry in entries:
+        names.setdefault(entry.value, entry.name)
+    return names
 
 
 def _print_indented(console: PlainConsole, name: str, text: str) -> None:
