@@ -176,6 +176,8 @@ def _help_paragraph(group: str) -> str:
     lines = []
     for top, names in sorted(folders.items()):
         start = f"  {top}/: " if top else "  "
+        if top and group == "preset":  # the name of the folder chooses by the data
+            start = f"  {top}, for "
         lines += textwrap.wrap(
             ", ".join(names), width, initial_indent=start, subsequent_indent="    ", break_on_hyphens=False
         )
@@ -188,9 +190,14 @@ def _help_paragraph(group: str) -> str:
 def is_part(group: str, option: str) -> bool:
     """Return whether an option is no choice of its own, but a part of others.
 
-    These options are the bases of experiments and what `debug=fast` changes in a single plugin.
+    These options are the bases of experiments, what `debug=fast` changes in a single plugin, and what a preset changes
+    in a single experiment.
     """
-    return option.endswith("/base") or (group == "debug" and "/" in option)
+    return (
+        option.endswith("/base")
+        or (group == "debug" and "/" in option)
+        or (group == "preset" and option.count("/") > 1)
+    )
 
 
 def groups() -> list[str]:
