@@ -74,10 +74,7 @@ MEANINGS = {
     "trainer": "Training: `trainer=default` or `ddp`; see below.",
     "budget": "Limit of run time or error, by which the knobs of a stored model are set; see below.",
     "logger": "Where the numbers of a run go: `logger=none`, or a list such as `[mlflow,csv,tensorboard]`; see below.",
-    "mode.members": "Folder of a sweep, or a list of runs.",
     "mode.files": "Folder or files to read.",
-    "mode.into": "Folder to write.",
-    "mode.run": "Folder of a run, or of several runs.",
     "experiment_name": "Name of the run in tables; the name of the experiment by default.",
     "stored": "Set by the framework from the command; not a setting of yours.",
 }
@@ -160,9 +157,10 @@ def _modes() -> Iterator[str]:
         comments = yaml_comments(text)
         values = {key: value for key, value in yaml.safe_load(text).items() if key != "name"}
         rows = [
-            f"| `mode.{key}` | {'must be set' if value == '???' else code(value)} "
-            f"| {in_cell(comments.get(key, MEANINGS.get(f'mode.{key}', '')))} |"
+            f"| `mode.{key}` | {code(value) if required is None else 'must be set'} "
+            f"| {in_cell(required[1] if required else comments.get(key, MEANINGS.get(f'mode.{key}', '')))} |"
             for key, value in values.items()
+            for required in [re.fullmatch("<(.*)>", str(value))]
         ]
         if rows:
             yield "\n".join(["| key | default | meaning |", "|---|---|---|", *rows])

@@ -129,7 +129,11 @@ mode=test | mode=test needs checkpoint=
 mode=test checkpoint=nowhere | Give the folder that a run printed at its start
 mode=predict mode.file=x | Did you mean 'files'?
 mode=predict mode.files=nowhere | Give a file, or a folder of files
-mode=combine | mode.members is missing
+mode=combine | mode.members is missing: give the folder of a sweep, or a list of runs
+mode=report | mode.run is missing: give the folder of a run or of a sweep
+mode=sync | mode.run is missing: give the folder of a run or of a sweep
+mode=new | mode.plugin is missing: give registry/name of the plugin, such as density_head/my_head
+mode=encode encoder=[bps] | mode.files is missing: give a folder of files or of shards
 mode=combine mode.members=nowhere | at least two are required
 mode=combine mode.members=nowhere uncertainty=[ensemble] | uncertainty=ensemble needs several models
 mode=encode mode.files=a mode.into=b | data.name is missing
