@@ -89,6 +89,7 @@ def test_a_model_takes_files_when_its_training_data_are_gone(
     model, frozen = package.load(done.folder), package.freeze(done.folder)
     assert torch.equal(torch.get_rng_state(), state), "loading does not draw from the global generator"
     assert f"trained on {kind}" in repr(model)
+    assert f"reads    inputs of shape {'×'.join(map(str, model.description.input_shape))}" in repr(model)
     density = [model(str(file)) for file in files]
     np.testing.assert_array_equal(np.asarray(density[0].mode), density[0].mode.numpy())
     monkeypatch.setenv("HOME", str(own))

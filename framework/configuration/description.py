@@ -71,14 +71,15 @@ class Description:
         names = " + ".join(part["name"] for part in parts)
         unit = {
             "angle": "angles in radians",
-            "real": "reals in their own unit",
+            "real": "real numbers in their own unit",
             "class": "classes",
             "image": "images",
         }
+        columns = f": {', '.join(self.columns)}" if self.columns else ""
         return "\n".join(
             [
                 f"{self.method or names}, trained on {self.config['data']['name']}{' (synthetic)' * self.synthetic}",
-                f"  reads    {'×'.join(map(str, self.input_shape))} {', '.join(self.columns)}".rstrip(),
+                f"  reads    inputs of shape {'×'.join(map(str, self.input_shape))}{columns}",
                 f"  predicts {unit[self.target.kind]}: {self.target.listed_names}",
                 f"  made of  {names}",
                 f"  from     {self.path}",
