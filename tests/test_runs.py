@@ -439,6 +439,13 @@ def test_a_store_locked_while_training_costs_no_number(framework: Framework) -> 
     assert dict(stored) == second.losses()
 
 
+@pytest.mark.parametrize("more", [(), ("debug=fast",)], ids=["whole", "short"])
+def test_a_short_run_says_that_its_numbers_mean_little(framework: Framework, more: tuple[str, ...]) -> None:
+    done = framework(*QUIET, *more)
+    assert done.code == 0, done.out
+    assert ("note: this is a short run" in done.out) == bool(more)
+
+
 @pytest.mark.parametrize("every", [1, 2])
 def test_a_log_shows_life_and_a_terminal_a_bar(framework: Framework, every: int) -> None:
     stopping = ("trainer.patience=1", "trainer.max_epochs=9", "optimizer.learning_rate=0.3")

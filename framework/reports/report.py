@@ -67,6 +67,12 @@ def report_test(run: Run, session: Session) -> None:
     ]
     title = f"{session.title}, {count_of(len(loader.dataset), 'test sample')}"  # type: ignore[arg-type]
     session.console.print(results_table(rows, {"method": "method", **columns, **COST_COLUMNS}, title=title))
+    if settings.is_short_test:
+        session.console.print(
+            "note: this is a short run, such as debug=fast makes, of at most ten training batches. Its numbers show "
+            "that every stage works, and not how good the model is.",
+            soft_wrap=True,
+        )
     if settings.pictures:
         _save_pictures(run, session, evaluation, synthetic)
     _next_steps(run, run_cost, session.console)
