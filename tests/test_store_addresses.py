@@ -2,6 +2,7 @@
 
 import os
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 from urllib.request import url2pathname
 
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from sqlalchemy.engine import make_url
 
 from framework.configuration.composition import in_quotes
-from framework.errors import ConfigError
+from framework.errors import ConfigError, DataError
 from framework.tracking.stores import (
     Address,
     address,
@@ -109,3 +110,52 @@ def test_a_database_without_its_package_is_refused(tmp_path: Path, monkeypatch: 
         address("postgresql+psycopg2://db/x", tmp_path)
     with pytest.raises(ConfigError, match="needs the package psycopg,"):
         address("postgresql://me:secret@db/x", tmp_path)
+
+
+ENDLESS = "WITH RECURSIVE counted(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM counted)"
+STATEMENTS = {
+    "view": f"CREATE VIEW runs AS {ENDLESS} SELECT x FROM counted",
+    "trigger": "CREATE TRIGGER runs AFTER INSERT ON kept BEGIN "
+    f"INSERT INTO kept SELECT x FROM ({ENDLESS} SELECT x FROM counted); END",
+    "condition": f"CREATE TRIGGER runs AFTER INSERT ON kept WHEN ({ENDLESS} SELECT count(*) FROM counted) > 1 BEGIN "
+    "SELECT RAISE(ABORT, 'no'); END",
+    "not UTF-8": b"CREATE VIEW runs AS SELECT '\xff'",
+    "virtual table": "CREATE VIRTUAL TABLE runs USING fts5(text)",
+}
+"""Statements that SQLite would run in queries of MLflow."""
+PLACEHOLDER = "CREATE VIEW runs AS SELECT 1"
+"""View whose statement is replaced by one that is not UTF-8, which Python cannot pass to SQLite."""
+
+
+@pytest.mark.parametrize("statement", STATEMENTS)
+def test_a_default_store_holds_tables_alone(statement: str, tmp_path: Path) -> None:
+    """A query of a view without end would never return."""
+    file = tmp_path / "mlflow.db"
+    uri = default_uri(tmp_path / "run")
+    require_own_files(uri)  # there is no file yet
+    with closing(sqlite3.connect(file)) as store, store:
+        store.execute("CREATE TABLE kept (x)")
+        store.execute("CREATE UNIQUE INDEX of_kept ON kept (x)")
+        store.execute(
+            "CREATE TRIGGER held BEFORE UPDATE ON kept WHEN OLD.x != NEW.x BEGIN SELECT RAISE(ABORT, 'no'); END"
+        )  # as MLflow makes one
+    require_own_files(uri)
+    with closing(sqlite3.connect(file)) as store, store:
+        store.execute(PLACEHOLDER if statement == "not UTF-8" else STATEMENTS[statement])
+        if statement == "not UTF-8":
+            store.execute("PRAGMA writable_schema = ON")
+            store.execute(
+                "UPDATE sqlite_master SET sql = CAST(? AS TEXT) WHERE name = 'runs'", [STATEMENTS[statement]]
+            )
+    with pytest.raises(DataError, match=r"holds runs, which is neither a table.*logger\.uri=sqlite"):
+        require_own_files(uri)
+    with closing(sqlite3.connect(file)) as store, store:
+        store.execute("PRAGMA writable_schema = ON")
+        store.execute("UPDATE sqlite_master SET type = 'table' WHERE name = 'runs'")
+    with closing(sqlite3.connect(file)) as store:
+        try:
+            store.execute("SELECT x FROM kept")
+        except sqlite3.DatabaseError:  # SQLite uses no database with such an entry
+            return
+    with pytest.raises(DataError, match="holds runs"):
+        require_own_files(uri)

@@ -197,7 +197,6 @@ SURVIVED = {("results_of_two_names", name) for name in ("test", "predict", "trai
     for attack in ("journal_linked", "record_piped")
     for name in ("test", "predict", "train from it")
 }
-SURVIVED |= {("own_store_that_is_changed_by_a_trigger", name) for name in ("resume", "sync")}
 """Commands that do not read the file, or write to the folder that they checked; they succeed and change nothing."""
 
 

@@ -9,6 +9,7 @@ addresses, and the program contacts the address that the user gave.
 import os
 import re
 from collections.abc import Iterator
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -30,6 +31,11 @@ _USER_WITH_SLASH = re.compile(r"(?<!sqlite)(://)[^/@:]*:")
 """Pattern of the beginning of an address with a user name and a password."""
 _KEY, _VALUE = re.compile(r"[?&][^=&\s]*+=?"), re.compile(r"[^&\s]*")
 """Patterns of a key in the query of an address, with its equals sign if there is one, and of a value."""
+_STORED = re.compile(
+    r"CREATE (TABLE|(UNIQUE )?INDEX)\s.*|CREATE TRIGGER [^()]*\sBEGIN\s+SELECT RAISE\(ABORT, '[^']*'\);\s*END",
+    re.DOTALL,
+)
+"""Pattern of the statements that a database may hold: tables, indices, and triggers that only refuse a change."""
 _SECRET = re.compile("pass|pwd|token|secret")
 """Pattern of the keys whose values are secret."""
 
@@ -168,20 +174,22 @@ def artifact_folder(uri: str, folder: Path) -> str | None:
 
 
 def require_own_files(uri: str, locations: tuple[str, ...] = ()) -> None:
-    """Refuse a store that the user did not name if it would read or write files outside its own folder.
+    """Refuse a store that the user did not name if it runs statements, or uses files outside its own folder.
 
     Args:
         uri: Address of an SQLite store.
         locations: Folders that the store records for the files of an experiment, a run or a model.
 
     Raises:
-        DataError: The store's file or one of the locations is a link or lies outside the folder.
+        DataError: The store's file or one of the locations is a link or lies outside the folder, or the store holds
+            a view or a trigger.
     """
     path = sqlite_path(uri)
     assert path is not None
     for ending in _BESIDE:
         require_plain_within(path.with_name(path.name + ending), path.parent)
     require_plain_within(path.with_name(f".{path.name}.lock"), path.parent)
+    _require_plain_tables(path)
     home = path.parent / "artifacts"
     for location in locations:
         parts = urlsplit(location)
@@ -195,6 +203,38 @@ def require_own_files(uri: str, locations: tuple[str, ...] = ()) -> None:
         require_plain_within(place, path.parent)
         if place != home:  # `home` itself contains the files of every run
             require_enclosed(place)
+
+
+def _require_plain_tables(path: Path) -> None:
+    """Refuse an SQLite database with views, virtual tables or triggers of its own, which SQLite runs in each query.
+
+    A view may return rows without end, and a trigger may write them, so that a command would never end. What counts is
+    the statement of an entry: SQLite runs it, whatever kind the entry states. A file that SQLite cannot read is
+    accepted here, because MLflow reports it; so is one that another process has locked for more than a second.
+
+    Raises:
+        DataError: The database holds such a statement.
+    """
+    import sqlite3  # only the default store needs it
+
+    statements: list[tuple[str, object]] = []
+    with (
+        suppress(sqlite3.Error),
+        closing(sqlite3.connect(f"{path.as_uri()}?mode=rw", uri=True, timeout=1)) as database,
+    ):
+        database.text_factory = _decode  # an error of decoding would hide a statement
+        statements = database.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL").fetchall()
+    for name, statement in statements:
+        if not isinstance(statement, str) or not _STORED.fullmatch(statement):
+            raise DataError(
+                f"The store {path}, which the command does not name, holds {shorten(name)}, which is neither a table "
+                "nor an index. It may come from another person, and SQLite would run its statement. If this is your "
+                f"store, add logger.uri={sqlite_uri(path)}"
+            )
+
+
+def _decode(text: bytes) -> str:
+    return text.decode("utf-8", "replace")
 
 
 def without_password(text: str) -> str:
