@@ -16,6 +16,7 @@ from framework.distributions.highest import highest
 from framework.distributions.many_components import FEWEST, likeliest_modes
 from framework.distributions.tempering import CircularPower
 from plugins.density_head.gaussian.density import Gaussian
+from plugins.density_head.projected_normal.density import ProjectedNormal
 from plugins.density_head.von_mises.density import VonMises
 
 ITEMS = 40
@@ -196,17 +197,58 @@ def test_members_that_agree_keep_their_mode_to_the_last_bit() -> None:
     assert torch.equal(Mixture(torch.zeros(1, 3), Stacked([one] * 3)).mode, one.mode)
 
 
-def test_a_density_that_knows_no_slope_keeps_the_best_component_s_mode() -> None:
-    class Silent(Distribution):
-        arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
-        support = Normal.support
-        mode = torch.tensor([[[0.0], [1.0], [1.2]]])
+class Silent(Distribution):
+    """Normal densities with the scale √½ around `places`, (1, component, number), that know no quadratic bound."""
 
-        def __init__(self) -> None:
-            super().__init__(torch.Size((1, 3)), torch.Size((1,)), validate_args=False)
+    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
+    support = Normal.support
 
-        def log_prob(self, value: Tensor) -> Tensor:
-            return -(value - self.mode).square().sum(-1)
+    def __init__(self, places: Tensor) -> None:
+        self.places = places
+        super().__init__(places.shape[:-1], places.shape[-1:], validate_args=False)
 
-    density = Mixture(torch.zeros(1, 3), Silent())
-    assert torch.equal(density.mode, torch.tensor([[1.0]]))
+    @property
+    def mode(self) -> Tensor:
+        return self.places
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return -(value - self.places).square().sum(-1)
+
+
+def test_several_numbers_without_a_slope_keep_the_best_component_s_mode() -> None:
+    places = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [1.2, 0.0]]])
+    assert torch.equal(Mixture(torch.zeros(1, 3), Silent(places)).mode, torch.tensor([[1.0, 0.0]]))
+
+
+@pytest.mark.parametrize("places", [(0.0, 0.0), (0.5, -0.5), (3.0, -3.0), (1e6, 1e6 + 1), (0.0, 1.0, 1.2)])
+def test_one_number_without_a_slope_is_highest_between_components(places: tuple[float, ...]) -> None:
+    """The mode equals that of the same mixture of densities that know their slope."""
+    center = torch.tensor(places, dtype=torch.float64).reshape(1, -1, 1)
+    weights = torch.arange(len(places), dtype=torch.float64).div(10).reshape(1, -1)
+    known = Mixture(weights, Gaussian(center, torch.full_like(center, 0.5**0.5)))
+    mode = Mixture(weights, Silent(center)).mode
+    torch.testing.assert_close(mode, known.mode, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("structure", ["projected normal", "with a narrow peak", "across ±π"])
+def test_a_mixture_of_skewed_angles_has_its_mode_between_components(
+    structure: str, dtype: torch.dtype
+) -> None:
+    """Two peaks 15° beside 0 have one maximum together, at 0, where no component has its mode."""
+    angles = math.radians(15) * torch.tensor([1.0, -1.0], dtype=torch.float64)
+    angles = angles + math.pi if structure == "across ±π" else angles
+    mean = 2 * torch.stack([angles.cos(), angles.sin()], -1)[None, :, None].to(dtype)
+    density = Mixture(torch.zeros(1, 2, dtype=dtype), ProjectedNormal(mean, torch.zeros_like(mean)))
+    if structure == "with a narrow peak":
+        peak = VonMises(torch.full((1, 1), 0.5, dtype=dtype), torch.full((1, 1), 1e3, dtype=dtype))
+        density = Mixture(torch.tensor([[0.5, -1.5]], dtype=dtype), Stacked([density, peak]))
+    axis = torch.linspace(-math.pi, math.pi, 20_001, dtype=torch.float64).to(dtype)
+    highest_on_grid = density.log_prob(axis[:, None, None]).amax(0)
+    assert (density.log_prob(density.mode) >= highest_on_grid - 1e-6).all()
+
+
+def test_members_without_a_slope_that_agree_keep_their_mode() -> None:
+    mean = torch.tensor([[[1.0, 2.0]], [[-30.0, 0.1]]])
+    member = ProjectedNormal(mean, 0.1 * mean)
+    assert torch.equal(Mixture(torch.zeros(2, 3), Stacked([member] * 3)).mode, member.mode)

@@ -1,5 +1,7 @@
 """Search for the highest point of a density, uphill from several starting points."""
 
+import math
+
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
@@ -13,6 +15,12 @@ STEPS = 16
 """Largest number of steps from one starting point."""
 LONGEST = 16.0
 """Longest step, as a multiple of the step to the maximum of the quadratic lower bound (`quadratic_bound`)."""
+SCALES = 48
+"""Number of distances from a starting point, each √½ of the previous one, at which `_search` evaluates the density."""
+SECTIONS = 60
+"""Number of golden-section steps of `_search`, which narrow a bracket to less than 1e-9 of its width."""
+GOLDEN = (3 - math.sqrt(5)) / 2
+"""Share of an interval at which a golden-section step divides it."""
 
 
 def highest(density: Distribution, starts: Tensor) -> Tensor:
@@ -20,7 +28,8 @@ def highest(density: Distribution, starts: Tensor) -> Tensor:
 
     If the `quadratic_bound` of the density is known, the point is a local maximum, up to the rounding of log_prob and
     unless more than STEPS steps are needed. It is not the global maximum if no ascent from a starting point leads
-    there. If the `quadratic_bound` is not known, the point is the starting point with the highest density.
+    there. If the `quadratic_bound` is not known, the point is a local maximum for a density of one number, which is
+    found by golden section, and for a density of several numbers the starting point with the highest density.
 
     Args:
         density: the density.
@@ -28,7 +37,10 @@ def highest(density: Distribution, starts: Tensor) -> Tensor:
     """
     height, which = density.log_prob(starts).topk(min(STARTS, len(starts)), 0)
     highest_starts = starts.gather(0, _over_event(density, which))
-    top, height = _climb(density, highest_starts, height)
+    if density.event_shape.numel() == 1 and quadratic_bound(density, highest_starts) is None:
+        top, height = _search(density, highest_starts, height, starts)
+    else:
+        top, height = _climb(density, highest_starts, height)
     return top.gather(0, _over_event(density, height.argmax(0, keepdim=True))).squeeze(0)
 
 
@@ -118,3 +130,51 @@ def _climb(density: Distribution, point: Tensor, height: Tensor) -> tuple[Tensor
             torch.where(wide, next_bound.stiffness, bound.stiffness),
         )
     return point, height
+
+
+@torch.no_grad()
+def _search(density: Distribution, point: Tensor, height: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a local maximum near each point for a density of one number, and the log-densities there.
+
+    The density is evaluated at distances of all orders of magnitude from each point, up to the farthest of the starting
+    points. The highest of these values and its two neighbours bracket a maximum, which a golden-section search narrows
+    (Kiefer 1953). A point stays unchanged where the gain is within the rounding of log_prob.
+
+    Args:
+        density: the density.
+        point: points where the search starts, (point, *batch, *event).
+        height: log-densities at these points, (point, *batch).
+        starts: all starting points, (start, *batch, *event).
+    """
+    angles = isinstance(density.support, Circular)
+
+    def evaluate(offset: Tensor) -> Tensor:
+        place = point + offset.reshape(*offset.shape, *(1,) * len(density.event_shape))
+        return density.log_prob(wrap(place) if angles else place)
+
+    away = starts.unsqueeze(1) - point
+    reach = (wrap(away) if angles else away).abs().amax(0).reshape(height.shape)
+    scales = 2.0 ** (-torch.arange(SCALES, dtype=point.dtype, device=point.device) / 2)
+    ascending = torch.cat([-scales, torch.zeros_like(scales[:1]), scales.flip(0)])
+    offsets = ascending.reshape(-1, *(1,) * reach.dim()) * reach
+    heights = torch.stack([evaluate(offset) for offset in offsets])
+    heights[SCALES] = height
+    best = heights.argmax(0, keepdim=True)
+    top = heights.gather(0, best).squeeze(0)
+    low, middle, high = (
+        offsets.gather(0, (best + side).clamp(0, 2 * SCALES)).squeeze(0) for side in (-1, 0, 1)
+    )
+    for _ in range(SECTIONS):
+        upper = high - middle >= middle - low
+        probe = middle + GOLDEN * torch.where(upper, high - middle, low - middle)
+        probed = evaluate(probe)
+        better = probed > top
+        # the better one of the two inner points becomes the middle, the other one an end
+        inner, outer = torch.where(better, probe, middle), torch.where(better, middle, probe)
+        low, high = torch.where(better == upper, outer, low), torch.where(better == upper, high, outer)
+        middle, top = inner, torch.where(better, probed, top)
+    least = 4 * torch.finfo(height.dtype).eps
+    gained = top - height > least * height.abs().clamp(min=1)
+    moved = point + middle.reshape(point.shape)
+    moved = wrap(moved) if angles else moved
+    return torch.where(gained.reshape(point.shape), moved, point), torch.where(gained, top, height)
