@@ -109,6 +109,18 @@ def count_of(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
+def significant(value: float, digits: int, *, sign: bool = False) -> str:
+    """Return a number with significant digits, such as "0.0123"; below a million it has no exponent, such as "1234".
+
+    Args:
+        value: the number.
+        digits: number of significant digits; more are returned for a number with more digits before the point.
+        sign: whether a positive number gets a plus sign.
+    """
+    text = f"{value:{'+' if sign else ''}.{digits}g}"
+    return f"{value:{'+' if sign else ''}.0f}" if "e+" in text and abs(value) < 1e6 else text
+
+
 def nearest_name(word: str, known: Iterable[str], likeness: float = LEAST_SIMILARITY) -> str | None:
     """Return the name most similar to `word`, or None if no name is similar.
 

@@ -1,5 +1,6 @@
 """Messages of errors, which stay unchanged wherever the error is raised."""
 
+import math
 import pickle
 import re
 from collections.abc import Callable
@@ -10,7 +11,15 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from framework import errors
-from framework.errors import CheckpointError, ConfigError, DataError, NonFiniteLoss, UserError, count_of
+from framework.errors import (
+    CheckpointError,
+    ConfigError,
+    DataError,
+    NonFiniteLoss,
+    UserError,
+    count_of,
+    significant,
+)
 
 
 class OfAPlugin(DataError):
@@ -128,6 +137,29 @@ def test_any_other_text_is_kept(kind: type[UserError], said: str) -> None:
 )
 def test_a_count_has_a_noun_in_the_right_number(number: int, expected: str) -> None:
     assert count_of(number, "file") == expected
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "expected"),
+    [
+        (0.0, 2, "0"),
+        (0.01234, 3, "0.0123"),
+        (12.34, 3, "12.3"),
+        (99.4, 2, "99"),
+        (99.96, 2, "100"),
+        (184.7, 2, "185"),
+        (-1234.5, 3, "-1234"),
+        (999_999.4, 4, "999999"),
+        (1.5e6, 2, "1.5e+06"),
+        (1e-7, 2, "1e-07"),
+        (math.inf, 2, "inf"),
+        (math.nan, 2, "nan"),
+    ],
+)
+def test_a_number_of_usual_size_has_no_exponent(value: float, digits: int, expected: str) -> None:
+    assert significant(value, digits) == expected
+    if value > 0:
+        assert significant(value, digits, sign=True) == f"+{expected}"
 
 
 def test_remarks_on_what_is_left_out_have_their_nouns_from_one_function() -> None:

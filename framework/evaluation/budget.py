@@ -19,7 +19,7 @@ from framework.data import Batch, Data
 from framework.datasets.fields import fetch
 from framework.density_head import DensityHead
 from framework.distributions.noise import Draw
-from framework.errors import ConfigError, did_you_mean
+from framework.errors import ConfigError, did_you_mean, significant
 from framework.evaluation.cost import device_name
 from framework.evaluation.significance import Difference, paired_difference
 from framework.evaluation.splits import BLOCK, evaluate, predict, silence
@@ -154,7 +154,7 @@ class Errors:
     def text(self) -> str:
         """Return the value with its standard error."""
         known = math.isfinite(self.standard_error)
-        return f"{self.value:.4g}" + (f" ± {self.standard_error:.2g}" if known else "")
+        return significant(self.value, 4) + (f" ± {significant(self.standard_error, 2)}" if known else "")
 
 
 def meet_budget(
@@ -210,9 +210,9 @@ def meet_budget(
     knobs.set(chosen)
     place = f"{device_name(CPU)} with threads={torch.get_num_threads()}"
     return (
-        f"budget: {knobs.text(chosen)} takes {milliseconds:.3g} ms per sample with {measure.key} {errors.text()}; "
-        f"{why}.{beside} Measured on {place}, in batches of {len(bench.timed['input'])}, errors with the first "
-        f"{bench.count} validation samples."
+        f"budget: {knobs.text(chosen)} takes {significant(milliseconds, 3)} ms per sample with {measure.key} "
+        f"{errors.text()}; {why}.{beside} Measured on {place}, in batches of {len(bench.timed['input'])}, errors with "
+        f"the first {bench.count} validation samples."
     )
 
 
@@ -337,10 +337,14 @@ class Bench:
         """Return the run time and the error of a setting, and its difference from the chosen setting, as text."""
         difference = self.worse(chosen, setting)
         value = self.measure.sign * difference.value
-        error = f" ± {difference.standard_error:.2g}" if math.isfinite(difference.standard_error) else ""
+        error = (
+            f" ± {significant(difference.standard_error, 2)}"
+            if math.isfinite(difference.standard_error)
+            else ""
+        )
         return (
-            f"{self.milliseconds[setting]:.3g} ms with {self.measure.key} {self.errors(setting).text()} (paired "
-            f"difference of the new setting: {value:+.2g}{error})"
+            f"{significant(self.milliseconds[setting], 3)} ms with {self.measure.key} {self.errors(setting).text()} "
+            f"(paired difference of the new setting: {significant(value, 2, sign=True)}{error})"
         )
 
     def score(self, setting: Setting) -> float:
@@ -376,7 +380,7 @@ def _within_time(bench: Bench, limit: float) -> tuple[Setting, str]:
     names = ", ".join(bench.knobs.names)
     raise ConfigError(
         f"budget.milliseconds = {limit:g}: no setting of {names} is so fast on this machine. The nearest is "
-        f"{bench.knobs.text(fastest)}, with {bench.milliseconds[fastest]:.3g} ms per sample in batches of "
+        f"{bench.knobs.text(fastest)}, with {significant(bench.milliseconds[fastest], 3)} ms per sample in batches of "
         f"{len(bench.timed['input'])} and {bench.measure.key} {bench.errors(fastest).text()}. Raise the budget, or "
         "choose a faster model."
     )
@@ -398,5 +402,5 @@ def _within_error(bench: Bench, limit: float) -> tuple[Setting, str]:
     raise ConfigError(
         f"budget.error = {limit:g}: no setting of {names} reaches {key} {side} {limit:g} on the validation samples. "
         f"The nearest is {bench.knobs.text(nearest)}, with {key} {bench.errors(nearest).text()} in "
-        f"{bench.milliseconds[nearest]:.3g} ms per sample. Allow a larger error, or choose a better model."
+        f"{significant(bench.milliseconds[nearest], 3)} ms per sample. Allow a larger error, or choose a better model."
     )

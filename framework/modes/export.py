@@ -8,7 +8,7 @@ from framework.configuration.loading import load_with_description
 from framework.configuration.paths import flatten
 from framework.deployment.export import export, require_packages
 from framework.deployment.loaded import apply_budget
-from framework.errors import ConfigError
+from framework.errors import ConfigError, significant
 from framework.runs.session import set_up_process
 from framework.storage.enclosed import require_enclosed
 
@@ -45,7 +45,7 @@ def run(config: Config) -> None:
         soft_wrap=True,
     )
     for count, times in content["milliseconds"].items():
-        forms = ", ".join(f"{name} {time:.3g}" for name, time in times.items())
+        forms = ", ".join(f"{name} {significant(time, 3)}" for name, time in times.items())
         console.print(f"processor milliseconds of a batch of {count}: {forms}", soft_wrap=True)
     for remark in description.remarks:
         console.print(remark, soft_wrap=True)

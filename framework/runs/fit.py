@@ -17,7 +17,7 @@ from framework.configuration.loading import fill, predictor_weights
 from framework.configuration.settings import TRAINER_OURS, CallbackSettings, Settings, device_of
 from framework.data import Batch, Data
 from framework.encoder import ChecksTraining, FitsInputs
-from framework.errors import ConfigError, count_of
+from framework.errors import ConfigError, count_of, significant
 from framework.model import FrozenFrontEnd, Model, fitted_models, learns
 from framework.runs.job import PRUNED, RECORD
 from framework.runs.resuming import begin_again, blame_checkpoint, resume_arguments
@@ -329,7 +329,7 @@ def _cache_features(session: Session) -> Data:
     seconds = time.perf_counter() - start
     session.console.print(
         f"features of {count_of(count, 'sample')} computed once in {seconds:.1f} s "
-        f"({1e3 * seconds / max(1, count):.2g} ms each)"
+        f"({significant(1e3 * seconds / max(1, count), 2)} ms each)"
     )
     return cached
 
