@@ -129,6 +129,23 @@ def test_a_setting_that_meets_an_error_only_by_luck_is_not_chosen(monkeypatch: p
     assert head.samples == 2
 
 
+@pytest.mark.parametrize("level", [1e-3, 1.0, 1e4])
+def test_of_settings_that_differ_by_rounding_the_fastest_is_chosen(
+    monkeypatch: pytest.MonkeyPatch, level: float
+) -> None:
+    """Each further sample lowers the error of all batches by the same share, which is float32 rounding."""
+
+    def errors(bench: Bench, setting: tuple[int, ...], repeat: int = 0) -> Errors:
+        value = level * (1 - 1e-7 * setting[0])
+        return Errors(value, 0.1 * level, (value, 2 * value, 3 * value))
+
+    monkeypatch.setattr(Bench, "errors", errors)
+    monkeypatch.setattr(Bench, "_times", lambda _, settings, calls: [float(count) for (count,) in settings])
+    predictor, head = model()
+    meet(predictor, milliseconds=1e6)
+    assert head.samples == 1
+
+
 def test_an_ensemble_is_loaded_and_predicts_with_fewer_members(
     framework: Framework, monkeypatch: pytest.MonkeyPatch
 ) -> None:

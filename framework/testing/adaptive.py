@@ -24,12 +24,16 @@ TOLERANCE = {1: 1e-10, 2: 1e-9}
 
 The errors of many boxes add up, so that this bound is far below that of the whole integral.
 """
+FAR = 16.0
+"""Distance from the mode, in widths, at which the direction of the tails of a density of two numbers is tested."""
+TOLERANCE_OF_MOMENTS = 1e-7
+"""Largest difference of the two integrals of a moment over a box that is not split, relative to the moment."""
 HEAVIEST = {1: 1.0, 2: 0.01}
 """Largest mass of a box that is not split, by the dimension of the density.
 
 Draws of two numbers are counted in boxes, so that no box may hold a large share of them.
 """
-ROUNDS = {1: 60, 2: 40}
+ROUNDS = {1: 60, 2: 80}
 """Largest number of rounds, in each of which boxes are split, by the dimension of the density."""
 MOST = {1: 128, 2: 48}
 """Largest number of boxes of one density that are split in one round, by the dimension of the density."""
@@ -40,6 +44,8 @@ HIDDEN = 2.0
 
 It is the ratio of the integrand at a known point in the box to the largest integrand at the nodes of the box.
 """
+UNSEEN_MASS = 1e-7
+"""Mass of a box of two numbers that may be missing where a known peak differs from the interpolated integrand."""
 RESOLVED = 1e-6
 """Largest rounding of values, in widths of the density, with which its integrals are compared."""
 AT_ONCE = 4096
@@ -64,6 +70,9 @@ class Boxes:
         mass: Mass of each box, (box, rows).
         mapping: Map from coordinates to values. The boxes are rectangles in these coordinates.
         low, high: Lower and upper corners of the boxes in these coordinates, (box, rows, number).
+        converged: Whether the two rules agree on the boxes of each density, (rows,). They may not for a density of two
+            numbers with a peak that is narrower than another one by many orders of magnitude. Densities of one number
+            count as converged.
     """
 
     value: Tensor
@@ -74,6 +83,7 @@ class Boxes:
     mapping: "_Map"
     low: Tensor
     high: Tensor
+    converged: Tensor
 
     @property
     def resolved(self) -> Tensor:
@@ -118,6 +128,49 @@ class Boxes:
             return rules
         outermost = (self.low == self.mapping.ends[0]).any(-1) | (self.high == self.mapping.ends[1]).any(-1)
         return rules + 100 * torch.where(outermost, shares[0].abs(), 0.0).sum(0)
+
+    def refined(self, function: Callable[[Tensor], Tensor]) -> "Boxes":
+        """Return boxes that are also split where the integral ∫ p f has an error.
+
+        Boxes that are split for p alone are too large in heavy tails, where p is small and p f is not.
+
+        Args:
+            function: f ≥ 0, a function of values of the density.
+        """
+        numbers = self.low.shape[-1]
+
+        def evaluate(low: Tensor, high: Tensor) -> tuple[Tensor, ...]:
+            sums, masses, rough = [], [], torch.zeros_like(low)
+            for points in RULES[numbers]:
+                value, log_prob, weight = _nodes(self.mapping, low, high, points)
+                mass = weight * log_prob.exp()
+                share = torch.where(mass > 0, mass * function(value).reshape(mass.shape), 0.0)
+                masses.append(mass.sum(1))
+                sums.append(share.sum(1))
+                if points == RULES[numbers][0]:
+                    even = share / rule(points, numbers)[1][:, None]
+                    rough = roughness(even.nan_to_num(), points, numbers)
+            gap = (sums[0] - sums[1]).abs()
+            can_split = gap.isfinite() & ((high - low).amax(-1) > 1e-13) & self.converged
+            gap = torch.where(can_split, gap, 0.0)
+            axis = torch.nn.functional.one_hot(rough.argmax(-1), numbers).bool()
+            return low, high, masses[0], gap, axis, sums[0]
+
+        parts = evaluate(self.low, self.high)
+        for _ in range(ROUNDS[numbers]):
+            split = int((parts[3] > TOLERANCE_OF_MOMENTS * parts[5].sum(0)).sum(0).max())
+            if split == 0:
+                break
+            split = min(split, 2 * MOST[numbers])
+            order = parts[3].argsort(0, descending=True)
+            low, high, axis = (gather_boxes(parts[index], order[:split]) for index in (0, 1, 4))
+            middle = torch.where(axis, (low + high) / 2, math.nan)
+            fresh = evaluate(torch.cat([low, middle.fmax(low)]), torch.cat([middle.fmin(high), high]))
+            parts = tuple(
+                torch.cat([gather_boxes(old, order[split:]), new])
+                for old, new in zip(parts, fresh, strict=True)
+            )
+        return _make_boxes(self.mapping, *parts[:3], converged=self.converged)
 
     def count(self, value: Tensor) -> Tensor:
         """Return the number of values in each box, (box, rows), float64; a value on a border counts for one box.
@@ -167,18 +220,30 @@ class _Map:
         density: Density with batch_shape (rows,).
         candidates: Values, (candidate, rows, number). The one with the highest density is the origin, since the mode
             that the density states may be wrong.
+        peaks: Values, (peak, rows, number). For densities of two real numbers, the peak with the largest mass is the
+            origin if its mass is above that around the highest value: the widths there are those of most of the mass,
+            while the highest peak may be a narrow one with a small weight.
     """
 
-    def __init__(self, density: Distribution, candidates: Tensor) -> None:
+    def __init__(self, density: Distribution, candidates: Tensor, peaks: Tensor) -> None:
         self.density = density
         height = self.log_prob(candidates)
+        rows = torch.arange(candidates.shape[1])
         best = height.where(~height.isnan(), -math.inf).argmax(0)
-        self.mode = candidates[best, torch.arange(len(best))]
+        self.mode = candidates[best, rows]
         self.angles = isinstance(density.support, Circular)
         self.has_ranges = isinstance(density.support, Circular) and density.support.ranges is not None
         if self.has_ranges:
             self.mode = wrap(self.mode)
-        self.scale = self._widths()
+        self.scale = self.widths(self.mode)
+        if not self.angles and self.mode.shape[1] == 2:
+            origins = torch.cat([self.mode.unsqueeze(0), peaks])
+            scales = torch.stack([self.scale, *map(self.widths, peaks)])
+            log_mass = self.log_prob(origins) + scales.log().sum(-1)
+            # another peak must have clearly more mass, so that equal peaks leave the origin where it is
+            log_mass[1:] -= math.log(2)
+            most = log_mass.where(~log_mass.isnan(), -math.inf).argmax(0)
+            self.mode, self.scale = origins[most, rows], scales[most, rows]
         self.slope = torch.zeros_like(self.mode[:, 0])
         if not self.angles and self.mode.shape[1] == 2:
             self._whiten()
@@ -208,15 +273,15 @@ class _Map:
         like = self.density.sample(torch.Size((0,)))
         return self.density.log_prob(value.to(like.dtype)).double()
 
-    def _widths(self) -> Tensor:
-        """Return the distance from the mode along each axis at which log p has fallen by half a nat, (rows, number)."""
+    def widths(self, peak: Tensor) -> Tensor:
+        """Return the distance from a peak along each axis at which log p has fallen by half a nat, (rows, number)."""
         steps = 2.0 ** torch.arange(-40, 2 if self.angles else 60, dtype=torch.float64)
-        top = self.log_prob(self.mode)
+        top = self.log_prob(peak)
         widths = []
-        for number in range(self.mode.shape[1]):
-            axis = torch.zeros(self.mode.shape[1], dtype=torch.float64)
+        for number in range(peak.shape[1]):
+            axis = torch.zeros(peak.shape[1], dtype=torch.float64)
             axis[number] = 1
-            values = self.mode + steps[:, None, None] * axis
+            values = peak + steps[:, None, None] * axis
             fallen = (top - self.log_prob(values) > 0.5).int()
             first = torch.where(
                 fallen.amax(0) > 0, fallen.argmax(0), 40
@@ -227,8 +292,9 @@ class _Map:
     def _whiten(self) -> None:
         """Set `slope`: the change of the most likely second number per change of the first number.
 
-        The slope is estimated by mixed second differences of log p, one width apart. The width of the first number is
-        then measured along this slope.
+        The slope is estimated by mixed second differences of log p, one width apart. It is 0 where log p falls faster
+        along it than along the axis: the numbers of a mixture of independent numbers are correlated at the mode, but
+        its tails follow the axes. The width of the first number is then measured along this slope.
         """
         first, second = self.scale[:, 0], self.scale[:, 1]
         corner = {}
@@ -238,7 +304,13 @@ class _Map:
         mixed = (corner[1, 1] - corner[1, -1] - corner[-1, 1] + corner[-1, -1]) / 4
         bend = corner[0, 1] + corner[0, -1] - 2 * corner[0, 0]
         slope = -mixed / bend * second / first
-        self.slope = torch.where(slope.isfinite(), slope, 0.0)
+        slope = torch.where(slope.isfinite(), slope, 0.0)
+        both_ways = torch.tensor([[[-FAR]], [[FAR]]], dtype=torch.float64)
+        along_axis, along_slope = (
+            self.log_prob(self.mode + both_ways * torch.stack([first, factor * first], -1)).sum(0)
+            for factor in (torch.zeros_like(slope), slope)
+        )
+        self.slope = torch.where(along_axis > along_slope, 0.0, slope)
         # along the conditional mode of the second number the width of the first is that of its marginal
         steps = 2.0 ** torch.arange(0, 60, dtype=torch.float64)
         offset = torch.stack([first, self.slope * first], -1)
@@ -282,7 +354,7 @@ def boxes(density: Distribution) -> Boxes:
     peak_values = mode_candidates(density)[:MOST_PEAKS].double()
     draws = density.sample(torch.Size((24,))).double()
     candidates = torch.cat([density.mode.unsqueeze(0).double(), peak_values, draws])
-    mapping = _Map(density, candidates)
+    mapping = _Map(density, candidates, peak_values)
     peak_coordinates = mapping.coordinates(peak_values)
     numbers = mapping.mode.shape[1]
     candidate_log_prob = mapping.log_prob(candidates)
@@ -314,7 +386,8 @@ def boxes(density: Distribution) -> Boxes:
         parts = tuple(
             torch.cat([gather_boxes(old, order[split:]), new]) for old, new in zip(parts, fresh, strict=True)
         )
-    return _make_boxes(mapping, *parts[:3])
+    open_urgency = parts[3].where(parts[3] > tolerance, 0.0).sum(0)
+    return _make_boxes(mapping, *parts[:3], converged=(open_urgency < UNSEEN_MASS) | (numbers == 1))
 
 
 def gather_boxes(part: Tensor, index: Tensor) -> Tensor:
@@ -425,10 +498,10 @@ def roughness(integrand: Tensor, points: int, numbers: int) -> Tensor:
 def _unlike_peaks(
     mapping: _Map, low: Tensor, high: Tensor, integrand: Tensor, points: int, peak_coordinates: Tensor
 ) -> Tensor:
-    """Return by how much the integrand at known peaks on a box's borders differs from its extrapolation, (box, rows).
+    """Return by how much the integrand at known peaks differs from its interpolation, (box, rows).
 
     A difference shows a peak that is too narrow for the nodes and too low to be far above the integrand beside it, such
-    as that of a component of small weight. The result is 0 for densities of two numbers.
+    as that of a component of small weight. For one number, peaks lie on borders of boxes.
 
     Args:
         mapping: Map from coordinates to values.
@@ -439,8 +512,10 @@ def _unlike_peaks(
         peak_coordinates: Coordinates of the known peaks.
     """
     unlike = torch.zeros_like(low[..., 0])
-    if low.shape[-1] > 1 or not len(peak_coordinates):
+    if not len(peak_coordinates):
         return unlike
+    if low.shape[-1] == 2:
+        return _unlike_peaks_and_ridges(mapping, low, high, integrand, points, peak_coordinates)
     value, volume = mapping.values_and_volumes(peak_coordinates)
     at_peak = (mapping.log_prob(value).exp() * volume).unsqueeze(1).nan_to_num() * (high - low)[..., 0]
     node, _ = np.polynomial.legendre.leggauss(points)
@@ -451,6 +526,42 @@ def _unlike_peaks(
         is_border = (peak_coordinates.unsqueeze(1) == border)[..., 0]
         unlike = torch.maximum(unlike, torch.where(is_border, (at_peak - expected).abs(), 0.0).amax(0))
     return unlike.clamp(max=1.0)
+
+
+def _unlike_peaks_and_ridges(
+    mapping: _Map, low: Tensor, high: Tensor, integrand: Tensor, points: int, peak_coordinates: Tensor
+) -> Tensor:
+    """Return by how much the integrand in a box differs from its interpolation at known peaks and ridges, (box, rows).
+
+    The function is `_unlike_peaks` for densities of two numbers. A ridge is compared where it crosses the middle of the
+    box. Differences below `UNSEEN_MASS` are 0, because quadrature is far more exact than interpolation.
+    """
+    grid = integrand.unflatten(1, (points, points))
+    node, _ = np.polynomial.legendre.leggauss(points)
+    inverse = torch.from_numpy(np.linalg.inv(np.polynomial.legendre.legvander(node, points - 1)))
+    unlike = torch.zeros_like(low[..., 0])
+    middle, size = (low + high) / 2, (high - low).clamp(min=1e-300)
+    for peak in peak_coordinates:
+        at = peak.expand_as(low)
+        within = (at >= low) & (at <= high)
+        for on_peak in ([True, True], [True, False], [False, True]):
+            chosen = torch.tensor(on_peak)
+            crossed = (within | ~chosen).all(-1)
+            if not bool(crossed.any()):
+                continue
+            probe = torch.where(chosen & within, at, middle)
+            unit = 2 * (probe - low) / size - 1
+            polynomials = [torch.ones_like(unit), unit]
+            for degree in range(1, points - 1):
+                polynomials.append(
+                    ((2 * degree + 1) * unit * polynomials[-1] - degree * polynomials[-2]) / (degree + 1)
+                )
+            weight = torch.stack(polynomials, -1) @ inverse  # (box, rows, number, node)
+            expected = torch.einsum("brn,brm,bnmr->br", weight[:, :, 0], weight[:, :, 1], grid)
+            value, volume = mapping.values_and_volumes(probe)
+            height = (mapping.log_prob(value).exp() * volume).nan_to_num() * (high - low).prod(-1)
+            unlike = torch.where(crossed, torch.maximum(unlike, (height - expected).abs()), unlike)
+    return torch.where(unlike > UNSEEN_MASS, unlike, 0.0).clamp(max=1.0)
 
 
 def _highest_polynomials(points: int) -> Tensor:
@@ -492,7 +603,7 @@ def _integrands_near_peaks(mapping: _Map, low: Tensor, high: Tensor, peak_coordi
     return torch.stack(highest)
 
 
-def _make_boxes(mapping: _Map, low: Tensor, high: Tensor, mass: Tensor) -> Boxes:
+def _make_boxes(mapping: _Map, low: Tensor, high: Tensor, mass: Tensor, *, converged: Tensor) -> Boxes:
     value, log_prob, weight = _nodes(mapping, low, high, RULES[low.shape[-1]][0])
     border = mass[:0]
     if low.shape[-1] == 1:
@@ -502,4 +613,6 @@ def _make_boxes(mapping: _Map, low: Tensor, high: Tensor, mass: Tensor) -> Boxes
         mass = mass.gather(0, order)
         ends = torch.cat([low[..., 0].gather(0, order), high[..., 0].amax(0, keepdim=True)])
         border = mapping.values_and_volumes(ends.unsqueeze(-1))[0][..., 0]
-    return Boxes(value, log_prob.flatten(0, 1), weight.flatten(0, 1), border, mass, mapping, low, high)
+    return Boxes(
+        value, log_prob.flatten(0, 1), weight.flatten(0, 1), border, mass, mapping, low, high, converged
+    )

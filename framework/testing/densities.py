@@ -19,6 +19,7 @@ from framework.distributions.protocol import (
     cdf,
     marginal,
     median,
+    mode_candidates,
     quadratic_bound,
     trigonometric_moments,
 )
@@ -224,12 +225,19 @@ def integral(density: Distribution, worst: Worst) -> None:
     """Check that the density integrates to 1.
 
     A density of one or two numbers or of three angles is integrated by adaptive quadrature. A density of three real
-    numbers is integrated on a grid, whose centre and width are determined by draws.
+    numbers is integrated on a grid, whose centre and width are determined by draws. Densities of two numbers for which
+    the quadrature does not converge are checked by draws (`integral_by_draws`), with a limit of 6 standard errors.
     """
     resolved = torch.ones(density.batch_shape, dtype=torch.bool)
     if density.event_shape in ((1,), (2,)):
         quadrature = boxes(density)
-        total, resolved = quadrature.mean(torch.ones_like(quadrature.log_prob)), quadrature.resolved
+        total = quadrature.mean(torch.ones_like(quadrature.log_prob))
+        resolved = quadrature.resolved & quadrature.converged
+        if not bool(quadrature.converged.all()):
+            by_draws = Worst()
+            by_draws.rows = worst.rows
+            integral_by_draws(density, by_draws, ~quadrature.converged)
+            worst.record(by_draws.error * 1e-6 / 6, by_draws.case)
     elif density.event_shape == (3,) and not isinstance(density.support, Circular):
         total = cells_around_draws(density).mass.sum((0, 1, 2))
     else:
@@ -239,13 +247,18 @@ def integral(density: Distribution, worst: Worst) -> None:
     worst.record(gap, lambda at: f"{worst.row(at[0])}: {total[at].item():.9g}")
 
 
-def integral_by_draws(density: Distribution, worst: Worst) -> None:
+def integral_by_draws(density: Distribution, worst: Worst, chosen: Tensor | bool = True) -> None:
     """Check by draws that the density integrates to 1; the error is in standard errors.
 
     Let p be the density and q a normal density. The check compares E_p[q/(p + q)] with E_q[p/(p + q)]. Both are equal
     to ∫ pq/(p + q) if p integrates to 1 and its draws follow it. All averaged values are in [0, 1], also for heavy
     tails. q is fitted to one half of the draws from p, and the average over p is taken over the other half. With the
     same draws, q would be too high at them: for ten numbers, the error would be several standard errors.
+
+    Args:
+        density: Density with batch_shape (rows,).
+        worst: Recorder of the largest error.
+        chosen: Rows that are checked, (rows,); True for all.
     """
     fit_draws, test_draws = density.sample(torch.Size((2 * DRAWS,))).double().chunk(2)
     support = density.support
@@ -276,6 +289,7 @@ def integral_by_draws(density: Distribution, worst: Worst) -> None:
     # nothing can be said where draws are rounded by more than the width of the density
     least = root.diagonal(dim1=-2, dim2=-1).abs().amin(-1)
     resolved = least > 1e4 * torch.finfo(torch.float64).eps * test_draws.abs().amax(0).amax(-1)
+    resolved = resolved & chosen
     gap = (of_p.mean(0) - of_q.mean(0)).abs() / (noise + UNSEEN / DRAWS)
     worst.record(
         gap.where(resolved, 0),
@@ -457,6 +471,11 @@ def entropy(density: Distribution, worst: Worst) -> None:
         quadrature = boxes(density)
         # of a density that float64 does not resolve, only the entropy is left
         expected = torch.where(quadrature.resolved, quadrature.entropy(), entropies.mean(0))
+        if not bool(quadrature.converged.all()):
+            surprise = _surprise(density, density.sample(torch.Size((DRAWS,))))
+            open_rows = quadrature.resolved & ~quadrature.converged
+            expected = torch.where(open_rows, surprise.mean(0), expected)
+            noise = noise + 1.2 * torch.where(open_rows, surprise.std(0), 0.0) / DRAWS**0.5
     else:
         draws = density.sample(torch.Size((DRAWS,)))
         surprise = _surprise(density, draws)
@@ -579,11 +598,14 @@ def median_is_best(density: Distribution, worst: Worst) -> None:
 def moments(density: Distribution, worst: Worst) -> None:
     """Compare mean and variance, if the density has them, with the quadrature; errors are in standard deviations.
 
-    The nodes of the quadrature are chosen for the density and not for its moments, so for heavy tails the moments by
-    the quadrature have an error. Only differences beyond this error count. If the density states that its variance does
-    not exist, the variance by the quadrature must be huge, and the mean need not exist either.
+    For two numbers, the boxes of the quadrature are refined for the variance. For heavy tails the moments by the
+    quadrature still have an error, and only differences beyond this error count. If the density states that its
+    variance does not exist, the variance by the quadrature must be huge, and the mean need not exist either.
     """
     quadrature = boxes(density)
+    if density.event_shape == (2,):
+        origin, scale = quadrature.mapping.mode, quadrature.mapping.scale
+        quadrature = quadrature.refined(lambda value: ((value - origin) / scale).square().sum(-1))
     offset = quadrature.value - quadrature.mapping.mode  # keeps the digits of a narrow density far from 0
     mean = torch.stack([quadrature.mean(part) for part in offset.unbind(-1)], -1)
     variance = torch.stack([quadrature.mean(part) for part in (offset - mean).square().unbind(-1)], -1)
@@ -601,13 +623,22 @@ def moments(density: Distribution, worst: Worst) -> None:
         )
         for power in (1, 2)
     )
+    if density.event_shape == (2,):
+        # The quadrature may have missed a peak of little mass, whose moments are large if it is far away.
+        missed = (quadrature.mean(torch.ones_like(quadrature.log_prob)) - 1).abs().unsqueeze(-1)
+        distances = [
+            (peak - quadrature.mapping.mode).abs() + 3 * quadrature.mapping.widths(peak)
+            for peak in mode_candidates(density).double()
+        ]
+        farthest = torch.stack(distances).amax(0)
+        first, second = first + missed * farthest, second + missed * farthest.square()
     stated = {}
     for name in ("mean", "variance"):
         try:
             stated[name] = getattr(density, name).double()
         except (NotImplementedError, AttributeError):
             worst.count(False, f"the density has no {name}")
-    none = ~quadrature.resolved.unsqueeze(-1).expand_as(variance)
+    none = ~(quadrature.resolved & quadrature.converged).unsqueeze(-1).expand_as(variance)
     if "variance" in stated:
         huge = variance + second > 1e6 * quadrature.mapping.scale.square()
         # for tails just too heavy for a variance, the integral is not huge within the range of the quadrature

@@ -16,6 +16,10 @@ TWO = Target("angle", ("azimuth", "elevation"))
 VIEWPOINT = Target("angle", ("azimuth", "elevation", "tilt"))
 CLASSES = Target("class", ("a", "b", "c"))
 REAL, REALS = Target("real", ("height",)), Target("real", ("x", "y"))
+HEAVY = {
+    "components": 3,
+    "component": {"name": "student_t", "degrees_of_freedom": 2.5, "balance": 0.0},
+}
 GAUSSIANS = {"components": 3, "component": {"name": "gaussian"}}
 NESTED = {"components": 2, "component": {"name": "mixture", "components": 3}}
 
@@ -69,6 +73,7 @@ ROWS = {
         HeadRow("two angles", TWO, {"components": 3}, cases=hard_cases),
         HeadRow("a real number", REAL, GAUSSIANS, cases=hard_cases),
         HeadRow("two real numbers", REALS, GAUSSIANS, cases=hard_cases),
+        HeadRow("two numbers with heavy tails", REALS, HEAVY, cases=hard_cases),
         HeadRow("mixture of mixtures", ONE, NESTED),
         HeadRow(
             "rotations",

@@ -1,13 +1,17 @@
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy import special, stats
 
 from framework.configuration.schema import build, resolve
 from framework.distributions.density import Mixture
 from framework.errors import ConfigError
 from framework.target import Target
-from framework.testing.head_subject import values
+from framework.testing.densities import examine_densities
+from framework.testing.head_subject import HeadSubject, values
+from framework.testing.rows import HeadRow
 from plugins.density_head.mixture.rows import NESTED, ONE, TWO
 
 
@@ -51,3 +55,39 @@ def test_a_component_that_is_fitted_afterwards_is_refused():
 def test_another_target_is_refused_by_the_component():
     with pytest.raises(ConfigError, match="von_mises"):
         build_head({}, Target("real", ("height",)))
+
+
+REAL_COMPONENTS = {
+    "gaussian": {"name": "gaussian"},
+    "student_t": {"name": "student_t", "degrees_of_freedom": 4.5},
+    "heavy tails": {"name": "student_t", "degrees_of_freedom": 2.5},
+    "predicted degrees of freedom": {"name": "student_t", "degrees_of_freedom": "predicted"},
+    "evidential": {"name": "evidential"},
+}
+
+
+@pytest.mark.parametrize("component", [name for name in REAL_COMPONENTS if name != "gaussian"])
+@pytest.mark.parametrize("numbers", [1, 2])
+@pytest.mark.parametrize("size", [0.1, 1.0, 10.0])
+def test_densities_of_students_t_are_products_as_scipy_has_them(component, numbers, size):
+    target = Target("real", ("x", "y")[:numbers])
+    head = build_head({"components": 3, "component": REAL_COMPONENTS[component]}, target).double()
+    with torch.no_grad():
+        density = head(size * torch.randn(4, head.size, dtype=torch.float64))
+        value = density.sample((50,))
+        found = density.log_prob(value)
+    parts = density.components
+    freedom = parts.freedom.expand_as(parts.location).numpy()
+    each = stats.t.logpdf(value.numpy()[:, :, None], freedom, parts.location.numpy(), parts.scale.numpy())
+    expected = special.logsumexp(density.log_weights.numpy() + each.sum(-1), axis=-1)
+    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("component", REAL_COMPONENTS)
+@pytest.mark.parametrize("name", ["integral", "entropy", "mean and variance"])
+def test_the_checks_of_two_numbers_pass_mixtures_of_very_different_components(component, name):
+    """Their quadrature must find narrow components of small weight, and must follow tails along the axes."""
+    target, config = Target("real", ("x", "y")), {"components": 3, "component": REAL_COMPONENTS[component]}
+    subject = HeadSubject(HeadRow("", target), lambda: build_head(config, target), only=name)
+    (finding,) = examine_densities(subject)
+    assert finding.holds, str(finding)
