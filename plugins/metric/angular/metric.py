@@ -9,6 +9,7 @@ from torch import Tensor
 from torchmetrics.utilities.data import dim_zero_cat
 
 from framework.distributions.circular import angular_distance
+from framework.distributions.sample_median import sample_median
 from framework.metric import Directions, Mean, Metric
 from framework.prediction import Prediction
 from framework.target import Target
@@ -57,7 +58,7 @@ class MeanAngularDeviation(Mean):
 
 
 class MedianAngularDeviation(Metric):
-    """Median absolute angular deviation of the point prediction, degrees.
+    """Median absolute angular deviation of the point prediction, degrees, with its standard error.
 
     For several angles, the deviation of a sample is the mean over its angles. The median of an even number of values is
     the mean of the middle two. The median shows how accurate a method is on its better half of the samples. In
@@ -86,8 +87,11 @@ class MedianAngularDeviation(Metric):
         collected = (
             dim_zero_cat(self.deviations) if len(self.deviations) else torch.empty(0, dtype=torch.float64)
         )
-        median = collected.quantile(0.5) if len(collected) else collected.new_tensor(torch.nan)
-        return {"median_deviation_deg": median * (180 / math.pi)}
+        median, error = sample_median(collected)
+        return {
+            "median_deviation_deg": median * (180 / math.pi),
+            "median_deviation_deg_sem": error * (180 / math.pi),
+        }
 
 
 def deviations(prediction: Prediction) -> Float[Tensor, "batch angle"]:

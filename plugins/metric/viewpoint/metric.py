@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torchmetrics.utilities.data import dim_zero_cat
 
+from framework.distributions.sample_median import sample_median
 from framework.errors import ConfigError
 from framework.geometry.rotation import geodesic_distance, viewpoint_rotation
 from framework.metric import Directions, Metric
@@ -21,7 +22,7 @@ class Viewpoint(Metric):
 
     Both use the distance Δ(R₁, R₂) = ||log(R₁ᵀR₂)||_F / √2 between the rotation matrices of the true and the predicted
     viewpoint (Tulsiani & Malik 2015; thesis Table 3.3). The median of an even number of errors is the mean of the
-    middle two. The share is returned with its standard error.
+    middle two. Both are returned with their standard errors.
 
     Raises:
         ConfigError: the target does not consist of the angles azimuth, elevation and tilt.
@@ -52,21 +53,12 @@ class Viewpoint(Metric):
 
     def compute(self) -> dict[str, Tensor]:
         errors = dim_zero_cat(self.errors) if len(self.errors) else torch.empty(0, dtype=torch.float64)
+        median, median_error = sample_median(errors)
         share = (errors < math.pi / 6).double().mean()
         return {
             "acc_pi_6": share,
             # the standard error of a share p of n is sqrt(p (1 - p) / (n - 1)); it is undefined for one sample: 0/0
             "acc_pi_6_sem": (share * (1 - share) / torch.tensor(max(len(errors) - 1, 0))).sqrt(),
-            "mederr_deg": _median(errors) * (180 / math.pi),
+            "mederr_deg": median * (180 / math.pi),
+            "mederr_deg_sem": median_error * (180 / math.pi),
         }
-
-
-def _median(values: Tensor) -> Tensor:
-    """Return the median of the values, for an even number of values the mean of the middle two.
-
-    It is NaN without values or if a value is NaN.
-    """
-    if len(values) == 0 or values.isnan().any():
-        return values.new_tensor(torch.nan)
-    ordered, count = values.sort().values, len(values)
-    return (ordered[(count - 1) // 2] + ordered[count // 2]) / 2
