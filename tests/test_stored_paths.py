@@ -234,6 +234,24 @@ def test_the_words_to_add_say_the_path(path: str) -> None:
 
 
 @pytest.mark.parametrize(
+    "path", ["houses.csv", "my_images", "my-data.v2", "nan.csv", "a/b", "./x.csv", "/d/1.csv"]
+)
+def test_plain_paths_are_written_without_quotes(path: str) -> None:
+    assert shell_arguments({"data.root": path}) == [f"data.root={path}"]
+    value = OverridesParser.create().parse_override(f"data.root={path}").value()
+    assert isinstance(value, str) and value == path
+
+
+@pytest.mark.parametrize(
+    "path", ["null", "True", "NaN", "inf", "1e5", "-3", "007", "a,b", "a b", "[x]", "a:b", "$x"]
+)
+def test_paths_that_hydra_would_read_as_something_else_have_quotes(path: str) -> None:
+    (word,) = shlex.split(shell_arguments({"data.root": path})[0])
+    assert word == f"data.root='{path}'"
+    assert str(OverridesParser.create().parse_override(word).value()) == path
+
+
+@pytest.mark.parametrize(
     ("arguments", "rewritten"),
     [
         ("mode=test checkpoint=a data.root=b", "mode=test checkpoint=a +stored.data.root=b"),

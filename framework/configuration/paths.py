@@ -205,6 +205,12 @@ def require_repeated(stored: Mapping[str, Any], repeated: Mapping[str, Any], fol
         )
 
 
+PLAIN = re.compile(
+    r"[A-Za-z0-9_.@-]*/[A-Za-z0-9_./@-]+|(?!(?i:null|true|false|nan|inf)\Z)[A-Za-z][A-Za-z0-9_.-]*"
+)
+"""Paths that Hydra reads as they are; others need quotes, so that they are not read as a number, null or a list."""
+
+
 def shell_arguments(paths: Mapping[str, Any]) -> list[str]:
     """Return the command-line arguments, quoted for a shell, that set the paths in `paths`, given by dotted keys."""
     return [shlex.quote(f"{shorten(key)}={_shell_value(value)}") for key, value in paths.items()]
@@ -218,9 +224,7 @@ def _shell_value(value: Any) -> str:
     if isinstance(value, list | tuple | set):
         return "[" + ",".join(map(_shell_value, value)) + "]"
     text = escape_unprintable(str(value), allowed="")
-    if isinstance(value, str) and not re.fullmatch(
-        r"[A-Za-z0-9_.@-]*/[A-Za-z0-9_./@-]+", text
-    ):  # quotes are needed so that it is not read as a number or null
+    if isinstance(value, str) and not PLAIN.fullmatch(text):
         # imports Hydra, which loading does not need
         from framework.configuration.composition import in_quotes
 
