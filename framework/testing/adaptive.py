@@ -129,7 +129,7 @@ class Boxes:
         outermost = (self.low == self.mapping.ends[0]).any(-1) | (self.high == self.mapping.ends[1]).any(-1)
         return rules + 100 * torch.where(outermost, shares[0].abs(), 0.0).sum(0)
 
-    def refined(self, function: Callable[[Tensor], Tensor]) -> "Boxes":
+    def split_for(self, function: Callable[[Tensor], Tensor]) -> "Boxes":
         """Return boxes that are also split where the integral ∫ p f has an error.
 
         Boxes that are split for p alone are too large in heavy tails, where p is small and p f is not.

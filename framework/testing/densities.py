@@ -605,7 +605,7 @@ def moments(density: Distribution, worst: Worst) -> None:
     quadrature = boxes(density)
     if density.event_shape == (2,):
         origin, scale = quadrature.mapping.mode, quadrature.mapping.scale
-        quadrature = quadrature.refined(lambda value: ((value - origin) / scale).square().sum(-1))
+        quadrature = quadrature.split_for(lambda value: ((value - origin) / scale).square().sum(-1))
     offset = quadrature.value - quadrature.mapping.mode  # keeps the digits of a narrow density far from 0
     mean = torch.stack([quadrature.mean(part) for part in offset.unbind(-1)], -1)
     variance = torch.stack([quadrature.mean(part) for part in (offset - mean).square().unbind(-1)], -1)

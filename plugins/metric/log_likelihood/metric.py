@@ -57,13 +57,13 @@ class Moments(Metric):
         self.unlikely = Unlikely()
 
     def remarks(self) -> tuple[str, ...]:
-        found = self.unlikely
-        if found.count == 0:
+        unlikely = self.unlikely
+        if unlikely.count == 0:
             return ()
         return (
-            f"log-likelihood: {found.count} of {found.samples} targets are more than {UNLIKELY:g} nats less likely "
-            f"than the median; the least likely is test sample {found.index}, target {found.target}, with "
-            f"{found.lowest:.4g} nats. Its predicted density is far too narrow, or the target is wrong. Such losses "
+            f"log-likelihood: {unlikely.count} of {unlikely.samples} targets are more than {UNLIKELY:g} nats less likely "
+            f"than the median; the least likely is test sample {unlikely.index}, target {unlikely.target}, with "
+            f"{unlikely.lowest:.4g} nats. Its predicted density is far too narrow, or the target is wrong. Such losses "
             "are bounded by heavier tails (density_head=student_t), by calibration (uncertainty=[folds]) and, for a "
             "target of several powers of ten, by predicting its logarithm.",
         )
