@@ -57,13 +57,13 @@ class Moments(Metric):
         self.unlikely = Unlikely()
 
     def remarks(self) -> tuple[str, ...]:
-        unlikely = self.unlikely
-        if unlikely.count == 0:
+        worst = self.unlikely
+        if worst.count == 0:
             return ()
         return (
-            f"log-likelihood: {unlikely.count} of {unlikely.samples} targets are more than {UNLIKELY:g} nats less likely "
-            f"than the median; the least likely is test sample {unlikely.index}, target {unlikely.target}, with "
-            f"{unlikely.lowest:.4g} nats. Its predicted density is far too narrow, or the target is wrong. Such losses "
+            f"log-likelihood: {worst.count} of {worst.samples} targets are more than {UNLIKELY:g} nats less likely "
+            f"than the median; the least likely is test sample {worst.index}, target {worst.target}, with "
+            f"{worst.lowest:.4g} nats. Its predicted density is far too narrow, or the target is wrong. Such losses "
             "are bounded by heavier tails (density_head=student_t), by calibration (uncertainty=[folds]) and, for a "
             "target of several powers of ten, by predicting its logarithm.",
         )

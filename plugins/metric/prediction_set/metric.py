@@ -121,9 +121,9 @@ class PredictionSetMetric(Metric):
         if self.stated is None:
             return ()
         if self._misses(float(self.covered), float(self.count)):
-            share_held = float(self.covered / self.count)
+            share = float(self.covered / self.count)
             return (
-                f"prediction_set: the sets hold {100 * share_held:.3g} % of the test targets, but {100 * self.stated:.4g} % "
+                f"prediction_set: the sets hold {100 * share:.3g} % of the test targets, but {100 * self.stated:.4g} % "
                 "are stated. The test samples differ from the validation samples that set the threshold, as later rows "
                 "or other groups do, or these are few. Rely neither on the sets nor on the densities for such samples.",
             )
