@@ -57,6 +57,7 @@ def test_it_is_the_model_that_was_trained_with_the_wrappers(framework: Framework
     assert numbers(again) == numbers(done) and "set by 20 validation samples" in again.out
     predicted = framework("mode=predict", f"checkpoint={done.folder}", *QUIET[:2], folder="predicted")
     assert predicted.code == 0 and "set" in (predicted.folder / "predictions.csv").read_text().splitlines()[0]
+    assert "predictions for the test split, because mode.files is not set, in " in predicted.out
     first, second = package.load(done.folder), package.load(both.folder)
     inputs = torch.randn(20, 2, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():

@@ -83,6 +83,7 @@ def test_a_model_takes_files_when_its_training_data_are_gone(
         "mode=predict", f"checkpoint={done.folder}", f"mode.files={own}", "logger=none", folder="predicted"
     )
     assert predicted.code == 0, predicted.out
+    assert "mode.files is not set" not in predicted.out
     lines = (predicted.folder / "predictions.csv").read_text().splitlines()
 
     state = torch.get_rng_state()

@@ -21,7 +21,7 @@ from framework.data import Batch, Data, Mapped
 from framework.distributions.intervals import DRAWS
 from framework.distributions.noise import Draw
 from framework.distributions.protocol import value_set
-from framework.errors import ConfigError
+from framework.errors import ConfigError, count_of
 from framework.evaluation.prediction_sets import (
     interval_columns,
     require_interval,
@@ -92,7 +92,9 @@ def run(config: Config) -> None:
             for row in zip(*table.values(), strict=True):
                 writer.writerow(map(defuse_formulas, row))
         run.tracker.log_artifact(path)
-        session.console.print(f"{len(table['sample'])} predictions in {path}", soft_wrap=True)
+        origin = "" if files else " for the test split, because mode.files is not set,"
+        count = count_of(len(table["sample"]), "prediction")
+        session.console.print(f"{count}{origin} in {path}", soft_wrap=True)
         if options.interval and any(key.endswith(ERRORS) for key in table):
             session.console.print(
                 f"The ends of intervals with a standard error other than 0 are order statistics of {DRAWS:,} random "
