@@ -13,7 +13,7 @@ from framework.metric import Directions, Metric
 from framework.prediction import Prediction
 
 UNLIKELY = 20.0
-"""Number of nats below the median log-likelihood of its batch at which a target is reported."""
+"""Number of nats below the median log-likelihood of its batch at which a target of one number is reported."""
 
 
 class Unlikely(NamedTuple):
@@ -22,6 +22,7 @@ class Unlikely(NamedTuple):
     Attributes:
         count: number of these targets.
         samples: number of all targets.
+        gap: smallest reported distance from the median, nats (`unlikely_gap`).
         lowest: lowest log-likelihood, nats.
         index: number of this sample in the split.
         target: its target, in the user's unit.
@@ -29,6 +30,7 @@ class Unlikely(NamedTuple):
 
     count: int = 0
     samples: int = 0
+    gap: float = UNLIKELY
     lowest: float = 0.0
     index: int = 0
     target: str = ""
@@ -38,8 +40,8 @@ class Moments(Metric):
     """Base class of the metrics of log-likelihood.
 
     The states are the moments of the log-likelihoods (`compute_moments`), and sums from which the sampling error is
-    computed (`summarize_sampling`). A remark counts real-valued targets that are more than UNLIKELY nats less likely
-    than the median of their batch, because a few such samples dominate the mean.
+    computed (`summarize_sampling`). A remark counts real-valued targets that are far less likely than the median of
+    their batch (`unlikely_gap`), because a few such samples dominate the mean.
     """
 
     moments: Tensor
@@ -61,11 +63,11 @@ class Moments(Metric):
         if worst.count == 0:
             return ()
         return (
-            f"log-likelihood: {worst.count} of {worst.samples} targets are more than {UNLIKELY:g} nats less likely "
+            f"log-likelihood: {worst.count} of {worst.samples} targets are more than {worst.gap:.3g} nats less likely "
             f"than the median; the least likely is test sample {worst.index}, target {worst.target}, with "
-            f"{worst.lowest:.4g} nats. Its predicted density is far too narrow, or the target is wrong. Such losses "
-            "are bounded by heavier tails (density_head=student_t), by calibration (uncertainty=[folds]) and, for a "
-            "target of several powers of ten, by predicting its logarithm.",
+            f"{worst.lowest:.4g} nats. Its predicted density is far too narrow, or the target is wrong. For a "
+            "table, such losses are bounded by heavier tails (density_head=student_t), by calibration "
+            "(uncertainty=[folds]) and, for a target of several powers of ten, by predicting its logarithm.",
         )
 
     def add_samples(self, log_prob: Float[Tensor, "batch"], estimate: Estimate) -> None:
@@ -125,20 +127,37 @@ class NegativeLogLikelihood(Moments):
         return results | {name: 0 - results[name] for name in ("nll", "nll_debiased") if name in results}
 
 
+def unlikely_gap(numbers: int) -> float:
+    """Return the distance in nats from the median log-likelihood at which a target of several numbers is reported.
+
+    The log-likelihood of a target of d numbers under a calibrated normal density is a constant minus half of a variable
+    with the distribution χ²_d, which spreads more for larger d. The distance is exceeded with the same probability for
+    each d; for one number it is UNLIKELY.
+    """
+    from scipy.special import chdtrc, chdtri
+
+    probability = chdtrc(1, 2 * UNLIKELY + chdtri(1, 0.5))
+    return float(chdtri(numbers, probability) - chdtri(numbers, 0.5)) / 2
+
+
 def add_unlikely(unlikely: Unlikely, prediction: Prediction) -> Unlikely:
     """Return `unlikely` with the targets of a batch; other targets than real numbers of the test split are ignored."""
     log_prob = prediction.log_prob.detach()
     if len(log_prob) == 0 or prediction.split != "test" or prediction.target.dim() != 2:
         return unlikely
-    count = unlikely.count + int((log_prob < log_prob.median() - UNLIKELY).sum())
     samples = unlikely.samples + len(log_prob)
+    below = log_prob.median() - log_prob
+    if not bool((below > UNLIKELY).any()):  # the gap of several numbers is larger
+        return unlikely._replace(samples=samples)
+    gap = unlikely_gap(prediction.target.shape[1])
+    count = unlikely.count + int((below > gap).sum())
     row = int(log_prob.argmin())
     lowest = float(log_prob[row])
     if count == unlikely.count or (unlikely.count and lowest >= unlikely.lowest):
         return unlikely._replace(count=count, samples=samples)
     index = prediction.batch["index"][row] if "index" in prediction.batch else row
     target = shorten(", ".join(f"{value:.4g}" for value in prediction.target[row].tolist()), 80)
-    return Unlikely(count, samples, lowest, int(index), target)
+    return Unlikely(count, samples, gap, lowest, int(index), target)
 
 
 def summary(

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import special
-from scipy.stats import norm, sem
+from scipy.stats import chi2, norm, sem
 from sklearn.metrics import log_loss
 from torch.distributions import Categorical, Distribution, Independent, Normal
 
@@ -14,7 +14,7 @@ from framework.configuration.schema import build, resolve
 from framework.distributions.protocol import Estimate, estimate, exact_estimate
 from framework.errors import UserError
 from framework.prediction import Prediction
-from plugins.metric.log_likelihood.metric import LogLikelihood, compute_moments, merge_moments
+from plugins.metric.log_likelihood.metric import LogLikelihood, compute_moments, merge_moments, unlikely_gap
 
 
 class KnownLikelihood(Distribution):
@@ -261,9 +261,23 @@ def test_targets_far_below_the_median_are_reported():
     assert not metric.remarks()
 
 
+@pytest.mark.parametrize("numbers", [1, 2, 10, 100, 1000])
+def test_targets_of_calibrated_densities_are_as_rarely_reported_for_many_numbers(numbers):
+    gap = unlikely_gap(numbers)
+    least = chi2.median(numbers) / 2 + gap
+    assert chi2.logsf(2 * least, numbers) == pytest.approx(chi2.logsf(40 + chi2.median(1), 1), rel=1e-9)
+    assert gap >= 20 - 1e-9
+    metric = LogLikelihood()
+    for distance in (0.99, 1.01):
+        density = KnownLikelihood(torch.tensor([0.0, -distance * gap, 0.0]))
+        metric.update(Prediction(density, {"target": torch.zeros(3, numbers)}))
+    (remark,) = metric.remarks()
+    assert f"1 of 6 targets are more than {gap:.3g} nats less likely" in remark
+
+
 def test_a_target_of_many_numbers_is_shortened():
     metric = LogLikelihood()
-    density = KnownLikelihood(torch.tensor([-1.0, -21.5, 0.0]))
+    density = KnownLikelihood(torch.tensor([-1.0, -210.5, 0.0]))
     metric.update(Prediction(density, {"target": torch.arange(300.0).reshape(3, 100)}))
     (remark,) = metric.remarks()
     assert len(remark) < 500 and "target 100, 101, 102" in remark
