@@ -125,6 +125,18 @@ def columns_by_number(key: str, heading: str, target: Target) -> dict[str, str]:
     return {key: f"{heading}, all numbers", **single}
 
 
+def jackknife_error(values: Float[Tensor, "sample"]) -> Float[Tensor, ""]:
+    """Return the standard error of a statistic by the jackknife; NaN for fewer than two samples.
+
+    `values` are the n values θ_j that the statistic has if sample j of n is left out. The standard error is
+    √((n - 1)/n Σ_j (θ_j - mean θ)²) (Efron & Tibshirani 1993, eq. 11.5).
+    """
+    count = len(values)
+    if count < 2:
+        return values.new_tensor(torch.nan)
+    return ((values - values.mean()).square().sum() * ((count - 1) / count)).sqrt()
+
+
 class HasFigure(ABC):
     """Additional base class of a metric that has a figure."""
 

@@ -11,7 +11,7 @@ from torchmetrics.utilities.data import dim_zero_cat
 
 from framework.distributions.class_probabilities import require_labels
 from framework.errors import ConfigError
-from framework.metric import Directions, HasFigure, Metric
+from framework.metric import Directions, HasFigure, Metric, jackknife_error
 from framework.prediction import Prediction
 from framework.target import Target
 
@@ -32,6 +32,9 @@ class CalibrationError(Metric, HasFigure):
     - `ece_positive`: only for two classes, the error of p(y = 1) against y = 1 in bins of equal width, independent of
       `probability`. This is exactly eq. 2.28-2.29: predictions of p(y = 1) = 0.9 and 0.1 do not share a bin.
     - `ece_equal_mass`: error in bins with equal numbers of samples; confidences within 2^-20 of each other share a bin.
+    - `ece_sem`, `ece_positive_sem`: standard errors over samples, by the jackknife. They do not contain the bias: by
+      chance, the error of a calibrated model is larger than 0. `ece_equal_mass` has none, because its bins change with
+      each sample.
     - `mce`: the largest difference in a nonempty bin of equal width.
     - `squared_ce_debiased`: the squared calibration error in bins of equal mass, minus the part that chance adds; the
       result may be negative. Bins with one sample are left out, because they do not allow this correction; the result
@@ -102,21 +105,27 @@ class CalibrationError(Metric, HasFigure):
 
     def compute(self) -> dict[str, Tensor]:
         confidence, right = self._collect_samples()
-        width = self._equal_width_bins(confidence, right)
+        width_index = equal_width(confidence, self.bins)
+        width = sum_by_bin(confidence, right, width_index, self.bins)
         mass = sum_by_bin(confidence, right, equal_mass(confidence, self.bins), self.bins)
         squared = squared_error_debiased(mass)
-        return {
+        results = {
             "ece": expected_error(width),
-            **(
-                {"ece_positive": expected_error(self._equal_width_bins(*self._collect_samples(2)))}
-                if self.two_classes
-                else {}
-            ),
+            "ece_sem": self._standard_error(confidence, right, width_index),
             "ece_equal_mass": expected_error(mass),
             "mce": largest_error(width),
             "ece_debiased": squared.clamp(min=0).sqrt(),
             "squared_ce_debiased": squared,
         }
+        if self.two_classes:
+            positive, label = self._collect_samples(2)
+            index = equal_width(positive, self.bins)
+            results["ece_positive"] = expected_error(sum_by_bin(positive, label, index, self.bins))
+            results["ece_positive_sem"] = self._standard_error(positive, label, index)
+        return results
+
+    def _standard_error(self, confidence: Tensor, right: Tensor, index: Tensor) -> Tensor:
+        return jackknife_error(errors_without_each(confidence, right, index, self.bins))
 
     def figure(self, title: str, *, synthetic: bool) -> "Figure":
         from plugins.metric.calibration_error.picture import reliability
@@ -243,6 +252,26 @@ def expected_error(bins: Bins) -> Float64[Tensor, ""]:
     add 0.
     """
     return (bins.confidence - bins.right).abs().sum() / bins.count.sum()
+
+
+def errors_without_each(
+    confidence: Float64[Tensor, "sample"],
+    right: Float64[Tensor, "sample"],
+    index: Int[Tensor, "sample"],
+    bins: int,
+) -> Float64[Tensor, "sample"]:
+    """Return the `expected_error` of all samples but one, for each of n samples, with the same bins; NaN for n = 1.
+
+    Args:
+        confidence: confidence of each sample.
+        right: whether each prediction is right (0 or 1).
+        index: bin of each sample.
+        bins: number of bins.
+    """
+    gap = confidence - right
+    total = gap.new_zeros(bins).index_add_(0, index, gap)
+    of_bin = total[index]
+    return (total.abs().sum() - of_bin.abs() + (of_bin - gap).abs()) / (len(gap) - 1)
 
 
 def largest_error(bins: Bins) -> Float64[Tensor, ""]:

@@ -75,18 +75,6 @@ def areas_without_each(
     return (before[start] + middle + rest) / (count - 1)
 
 
-def jackknife_error(values: Float[Tensor, "count"]) -> Float[Tensor, ""]:
-    """Return the standard error of a statistic by the jackknife; NaN for fewer than 2 samples.
-
-    `values` are the n values θ_j that the statistic has if sample j of n is left out. The standard error is sqrt((n -
-    1)/n Σ_j (θ_j - mean θ)²) (Efron & Tibshirani 1993, eq. 11.5).
-    """
-    count = len(values)
-    if count < 2:
-        return values.new_tensor(torch.nan)
-    return ((values - values.mean()).square().sum() * ((count - 1) / count)).sqrt()
-
-
 def error_at_coverage(
     confidence: Float[Tensor, "count"], risk: Float[Tensor, "count"], coverage: float
 ) -> Float[Tensor, ""]:

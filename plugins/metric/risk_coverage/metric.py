@@ -10,7 +10,7 @@ from torchmetrics.utilities.data import dim_zero_cat
 from framework.distributions.checks import refuse_nan
 from framework.distributions.circular import angular_distance
 from framework.errors import ConfigError
-from framework.metric import Directions, HasFigure, Metric
+from framework.metric import Directions, HasFigure, Metric, jackknife_error
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.risk_coverage.functional import (
@@ -19,7 +19,6 @@ from plugins.metric.risk_coverage.functional import (
     at_coverage,
     curve,
     error_at_coverage,
-    jackknife_error,
 )
 
 if TYPE_CHECKING:

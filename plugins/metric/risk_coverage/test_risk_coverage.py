@@ -10,6 +10,7 @@ from torch.distributions import Categorical, Independent, Normal
 
 from framework.configuration.schema import build, resolve
 from framework.errors import UserError
+from framework.metric import jackknife_error
 from framework.prediction import Prediction
 from framework.target import Target
 from framework.testing.metrics import Cardioid
@@ -19,7 +20,6 @@ from plugins.metric.risk_coverage.functional import (
     at_coverage,
     curve,
     error_at_coverage,
-    jackknife_error,
 )
 from plugins.metric.risk_coverage.metric import RiskCoverage
 
