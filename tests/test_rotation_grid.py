@@ -69,6 +69,20 @@ def test_other_numbers_of_cells_are_refused():
         level_of(100)
 
 
+@pytest.mark.parametrize("count", [2, 4, 24, 72, 200])
+def test_rounding_does_not_choose_the_distant_rotations(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    expected = distant_rotations(count)
+    exact = quaternions.of_viewpoint
+    noise = torch.Generator().manual_seed(0)
+
+    def rounded(angles: torch.Tensor) -> torch.Tensor:
+        turns = exact(angles)
+        return turns * (1 + 1e-14 * torch.randn(turns.shape, generator=noise, dtype=turns.dtype))
+
+    monkeypatch.setattr(quaternions, "of_viewpoint", rounded)
+    torch.testing.assert_close(distant_rotations(count), expected, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("count, least_deg", [(2, 179), (4, 179), (24, 80), (72, 50), (500, 25)])
 def test_distant_rotations_are_far_from_one_another(count, least_deg):
     turns = distant_rotations(count)
@@ -80,5 +94,5 @@ def test_distant_rotations_are_far_from_one_another(count, least_deg):
 
 
 def test_more_distant_rotations_than_the_finest_grid_spreads_are_refused():
-    with pytest.raises(ValueError, match="Got 200000 rotations, but at most 147456 can be spread"):
+    with pytest.raises(ValueError, match="Got 200000 rotations, but at most 18432 can be spread"):
         distant_rotations(200_000)

@@ -25,8 +25,13 @@ OFFSET = 0.05
 
 Without it, angles of 0° and 90°, which many data contain, would lie on borders of cells.
 """
-FINER = 16
+FINER = 128
 """Least number of cells, for each of the rotations that are chosen far from one another."""
+DIGITS = 9
+"""Number of decimals in which distances are compared, so that rounding decides between no equal distances.
+
+The grid has many symmetries, and the last bits of a product of matrices depend on the processor.
+"""
 SUBDIVISION = 32
 """Number of parts into which each side of a pixel is divided to compute the mean of log cos e over the pixel."""
 
@@ -72,7 +77,7 @@ def distant_rotations(count: int) -> Float[Tensor, "count 4"]:
     chosen = [0]
     nearest = (turns @ turns[0]).abs()  # cosine of half the angle to the nearest chosen rotation
     for _ in range(count - 1):
-        chosen.append(int(nearest.argmin()))
+        chosen.append(int(nearest.round(decimals=DIGITS).argmin()))  # the first one of several
         nearest = torch.maximum(nearest, (turns @ turns[chosen[-1]]).abs())
     return turns[chosen]
 
