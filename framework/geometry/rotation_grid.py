@@ -25,8 +25,13 @@ OFFSET = 0.05
 
 Without it, angles of 0° and 90°, which many data contain, would lie on borders of cells.
 """
-FINER = 128
+FINER = 16
 """Least number of cells, for each of the rotations that are chosen far from one another."""
+FIRST = 2
+"""Index of the first of these rotations.
+
+From the cell with index 0, the order of the grid leads to rotations of which some are nearer to one another.
+"""
 DIGITS = 9
 """Number of decimals in which distances are compared, so that rounding decides between no equal distances.
 
@@ -74,8 +79,8 @@ def distant_rotations(count: int) -> Float[Tensor, "count 4"]:
             f"Got {count} rotations, but at most {sizes[-1] // FINER} can be spread. Ask for fewer."
         )
     turns = quaternions.of_viewpoint(centres(cells))
-    chosen = [0]
-    nearest = (turns @ turns[0]).abs()  # cosine of half the angle to the nearest chosen rotation
+    chosen = [FIRST]
+    nearest = (turns @ turns[FIRST]).abs()  # cosine of half the angle to the nearest chosen rotation
     for _ in range(count - 1):
         chosen.append(int(nearest.round(decimals=DIGITS).argmin()))  # the first one of several
         nearest = torch.maximum(nearest, (turns @ turns[chosen[-1]]).abs())
