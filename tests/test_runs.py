@@ -586,7 +586,7 @@ def test_a_sweep_that_was_killed_closes_its_parent_when_it_is_repeated(
             f"select value from tags where key = 'mlflow.note.content' and {of_parent}"
         ).fetchone()
     assert numbers == (0,), "they would be charts of the parent alone"
-    assert said.startswith(f"A sweep in `{sweep}`: 1 runs over")
+    assert said.startswith(f"A sweep in `{sweep}`: 1 run over")
     assert "| method | data |" in said
 
 
