@@ -133,7 +133,7 @@ def test_rounding_is_not_significant(size: float, runs: int, spread: float, roun
         "to float32": first.astype(np.float32).astype(np.float64),
     }[rounding]
     for pair in ((first, second), (second, first)):
-        found = paired_difference(*pair)
+        found = paired_difference(*(numbers.tolist() for numbers in pair))
         assert found.probability == 1 or runs == 1
         assert abs(found.value) <= found.rounding
         means = [_over_runs(numbers) for numbers in pair]
