@@ -1039,8 +1039,8 @@ def nodes(low: float, high: float) -> tuple[Tensor, Tensor]:
     at, share = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(24))
     if high - low > 6:
         at, share = (
-            torch.arange(16, dtype=torch.float64) / 8 - 1,
-            torch.full((16,), 1 / 8, dtype=torch.float64),
+            torch.arange(24, dtype=torch.float64) / 12 - 1,
+            torch.full((24,), 1 / 12, dtype=torch.float64),
         )
     return (low + high) / 2 + (high - low) / 2 * at, (high - low) / 2 * share
 
