@@ -50,7 +50,7 @@ def read_parquet(stream: BinaryIO) -> ParquetColumns:
             `require_numbers` and `most_decompressed` allow.
         OSError: the file is damaged.
     """
-    from pyarrow import parquet  # loads 50 MB of libraries, which other tables do not need
+    from pyarrow import parquet  # loads libraries that other tables do not need
 
     size = stream.seek(0, 2)
     stream.seek(0)

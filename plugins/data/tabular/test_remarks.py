@@ -18,8 +18,8 @@ ROWS = 60
 
 
 def build_data(path: Path | None = None, **config: Any) -> Tabular:
-    given = {"name": "tabular", "target": "y", "kind": "real", "words": "levels", **config}
-    return build("data", resolve("data", given if path is None else {**given, "path": str(path)}))
+    settings = {"name": "tabular", "target": "y", "kind": "real", "words": "levels", **config}
+    return build("data", resolve("data", settings if path is None else {**settings, "path": str(path)}))
 
 
 def prepare_data(folder: Path, text: str, **config: Any) -> Tabular:
@@ -106,9 +106,9 @@ def test_rows_far_outside_the_training_rows_are_reported(
         else:
             frame = pd.read_csv(file)
             model.inputs(frame if way == "frame" else frame.to_numpy())
-    said = " ".join(model.remarks) if way == "test" else caplog.text
-    assert message in said
-    assert ("far outside" in said) == bool(message)
+    messages = " ".join(model.remarks) if way == "test" else caplog.text
+    assert message in messages
+    assert ("far outside" in messages) == bool(message)
 
 
 def test_another_value_of_a_constant_column_is_far_and_rounding_is_not(

@@ -75,12 +75,12 @@ def test_densities_of_students_t_are_products_as_scipy_has_them(component, numbe
     with torch.no_grad():
         density = head(size * torch.randn(4, head.size, dtype=torch.float64))
         value = density.sample((50,))
-        found = density.log_prob(value)
+        log_prob = density.log_prob(value)
     parts = density.components
     freedom = parts.freedom.expand_as(parts.location).numpy()
     each = stats.t.logpdf(value.numpy()[:, :, None], freedom, parts.location.numpy(), parts.scale.numpy())
     expected = special.logsumexp(density.log_weights.numpy() + each.sum(-1), axis=-1)
-    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(log_prob.numpy(), expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("component", REAL_COMPONENTS)
